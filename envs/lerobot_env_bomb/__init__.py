@@ -9,7 +9,7 @@ import gymnasium
 from lerobot_bomb.bomb.episode import CONTROL_MODES, EpisodeSpec
 from lerobot_bomb.bomb.suites import SUITES
 
-# Gymnasium id -> what an episode of it is: bomb/place-v0 (relative control), bomb/place-absolute-v0
+# Gymnasium id -> spec of its episodes: bomb/place-v0 (relative control), bomb/place-absolute-v0
 GYM_IDS = {
     f"bomb/{suite}{'' if mode == 'relative' else '-' + mode}-v0": EpisodeSpec(0, suite, control_mode=mode)
     for suite in SUITES

@@ -21,7 +21,7 @@ class Actuator:
         self._pending = deque([rest] * (0 if dynamics is None else dynamics.latency))
 
     def command(self, action: np.ndarray, gripper_xyz: np.ndarray) -> tuple[np.ndarray, bool]:
-        """(4,) action -> (3,) position in metres to go to now, whether to open the fingers."""
+        """(4,) action -> (3,) position in metres to go to now, and True to open the fingers."""
         self._pending.append(action)
         executed = self._pending.popleft()
         target_xyz = executed[:3] if self._is_absolute else gripper_xyz + MAX_STEP_M * executed[:3]

@@ -1,4 +1,4 @@
-"""Other instructions of an episode, each with one word that means something else."""
+"""Other instructions for an episode, each with one word changed."""
 
 from collections.abc import Iterator
 from dataclasses import replace

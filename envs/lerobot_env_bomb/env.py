@@ -51,20 +51,20 @@ class _Run:
 
     @property
     def num_made(self) -> int:
-        """Moves that have been made."""
+        """Number of moves that have been made."""
         return self.moves_before + self.judge.num_made
 
 
 class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
-    """Task: place a Go stone on the intersection that an instruction names by row and column.
+    """Task: place a Go stone on the intersection that an instruction names; other suites have other tasks.
 
-    Randomizations: target (always free and legal), colour, instruction, 0-8 stones on the board, gripper
-    and stone at the start.
+    Randomizations of suite `place`: target (always free and legal), colour, instruction, 0-8 stones on the
+    board, gripper and stone at the start.
     Success: see `Judge`. Reward is 1 on the step that ends in success, else 0.
 
     Action: float32 (4,). Relative: x, y, z in units of MAX_STEP_M per control step from where the
     gripper is; absolute: x, y, z in metres. The fourth opens the fingers at >= 0 and closes them below.
-    One outside the action space is clipped.
+    An action outside the action space is clipped.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": DEFAULT_FPS}  # noqa: RUF012
@@ -185,7 +185,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
             self._renderer = None
 
     def privileged_state(self) -> PrivilegedState:
-        """The simulator's true state."""
+        """Return the simulator's true state."""
         run, now = self._run, self._now
         return PrivilegedState(
             gripper_xyz=now.gripper_xyz,
@@ -214,7 +214,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         }
 
     def cameras(self) -> dict[str, PinholeCamera]:
-        """Return the current pose of each camera of the observation's images."""
+        """Return intrinsics and current pose of each camera of the observation's images."""
         scene, size = self._run.scene, self._render_options.image_size
         return {
             camera: PinholeCamera(intrinsics(scene.model, camera, size), extrinsics(scene.data, camera))
@@ -240,7 +240,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         }
 
     def _view(self, camera: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """(H, W, 3) uint8 image; depth, intrinsics and extrinsics by key, if they are asked for."""
+        """(H, W, 3) uint8 image; depth, intrinsics and extrinsics by key, if requested."""
         scene, size = self._run.scene, self._render_options.image_size
         if not self._render_options.depth:
             return self._draw(camera, size), {}
@@ -256,7 +256,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return self._sense(self._camera_renderer.draw(self._run.scene.data, camera, size), camera)
 
     def _sense(self, image: np.ndarray, camera: str) -> np.ndarray:
-        """The image as the camera's sensor takes it in this step."""
+        """Return the image as the camera's sensor takes it in this step."""
         number = len(CAMERAS) * self._steps + CAMERAS.index(camera)
         return self._run.episode.perturbation.sense(image, number)
 

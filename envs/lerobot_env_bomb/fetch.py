@@ -19,7 +19,7 @@ MAX_HALF_OPENING_M = 0.0165  # of one finger; outer faces then clear a neighbour
 PREFIX = "robot0:"  # of all names in Fetch's model
 TORSO_XYZ = (0.04, 0.7095, 0.03)  # metres, where the torso stands; it looks at the board, towards -y
 TORSO_QUAT = (np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5))
-# What no camera of ours sees; the rolls are held still, which leaves the other five joints one solution.
+# Bodies that no camera of ours sees; rolls are held still, which leaves the other five joints one solution.
 LEFT_OUT_BODIES = ("head_pan_link", "gripper_camera_link")
 LEFT_OUT_JOINTS = ("torso_lift_joint", "upperarm_roll_joint", "forearm_roll_joint")
 
@@ -42,7 +42,7 @@ FINGER_INERTIA = (5e-6, 1e-5, 1e-5)  # kg m^2
 
 
 def load_fetch() -> mujoco.MjSpec:
-    """BOMB's scene with the Fetch arm."""
+    """Load BOMB's scene with the Fetch arm."""
     fetch = mujoco.MjSpec.from_file(str(fetch_xml()))
     for name in LEFT_OUT_BODIES:
         fetch.delete(fetch.body(PREFIX + name))

@@ -1,4 +1,4 @@
-"""Model file of the Fetch arm in gymnasium-robotics, and whether it can be used here.
+"""Model file of the Fetch arm in gymnasium-robotics, and the check that it can be used here.
 
 Imports neither MuJoCo nor gymnasium-robotics, so that flags are checked at once.
 """
@@ -21,7 +21,7 @@ def check_robot(spec: EpisodeSpec) -> None:
 
 
 def fetch_xml() -> Path:
-    """The MJCF file of the installed Fetch model."""
+    """Return the MJCF file of the installed Fetch model; a ValueError says why there is none."""
     mujoco_version = importlib.metadata.version("mujoco")
     if int(mujoco_version.split(".")[0]) >= FIRST_MUJOCO_WITHOUT_FETCH:
         raise ValueError(

@@ -27,7 +27,7 @@ SUNK_M = 0.05
 PARKED_XYZ = (1.0, 1.0, -0.5)  # metres, below the table: where stones wait that an episode does not use
 PARKED_SPACING_M = 0.05
 
-# N m s/rad. Stops within a second what would roll or spin on its rim for ever; too little to slow a flight.
+# N m s/rad. Stops within a second a stone that rolls or spins on its rim; too little to slow a flight.
 STONE_DAMPING = 3e-6
 
 NUM_FEET = 4  # balls that a stone stands on
@@ -50,7 +50,7 @@ PATTERN_LINE_WIDTH_M = 0.0010
 PATTERN_STONE_HEIGHT_M = 0.0005
 MAX_PATTERN_STONES = 4
 STONE_RGBA = {True: (0.96, 0.96, 0.93, 1.0), False: (0.06, 0.06, 0.07, 1.0)}  # by "is white"
-HIDDEN = 0.0  # opacity of what only a perturbation shows
+HIDDEN = 0.0  # opacity of geoms that only a perturbation or a pattern shows
 
 
 def compile_scene(robot: Robot) -> mujoco.MjModel:
@@ -282,8 +282,8 @@ def _add_stone(spec: mujoco.MjSpec, index: int) -> None:
     body = spec.worldbody.add_body(name=name, pos=parked_xyz(index))
     body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_FREE, damping=STONE_DAMPING)
     body.add_geom(spec.find_default("rim"), name=name, size=[radius, half_height, 0])
-    # A stone stands on balls in its rim: contact of balls with boxes is exact, where that of a flat
-    # cylinder with a flat box, found by search, lets the stone come to rest a millimetre inside the board.
+    # A stone stands on balls in its rim: contact of balls with boxes is exact, while contact of a flat
+    # cylinder with a flat box, found by search, lets a stone come to rest a millimetre inside the board.
     for foot in range(NUM_FEET):
         angle_rad = 2 * np.pi * (foot + 0.5) / NUM_FEET
         center = (radius - half_height) * np.array([np.cos(angle_rad), np.sin(angle_rad)])

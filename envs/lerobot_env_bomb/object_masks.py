@@ -1,4 +1,4 @@
-"""Masks of what each pixel of a camera's image shows."""
+"""Masks of the objects in a camera's image."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ BOARD_GEOMS = ("board", "board_surface")
 def object_masks(
     scene: Scene, renderer: CameraRenderer, camera: str, size: int, stone: int, target_xy: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """{object: (size, size) bool}; every pixel belongs to one.
+    """{object: (size, size) bool}; every pixel belongs to exactly one.
 
     ``stone``: index of the stone to move; ``target_xy``: (2,) metres, its target. The target is as
     much of the board as a stone there would cover; the gripper is all of the arm that is seen.

@@ -20,7 +20,7 @@ class Perturbation(EpisodePerturbation[Transform]):
         return tuple(each.edit_model for each in self.transforms.values())
 
     def arrange(self, layout: Layout, supply: tuple[int, ...]) -> Layout:
-        """The layout after all changes; `supply`: indices of the stones in the tray."""
+        """Return the layout after all changes; `supply`: indices of the stones in the tray."""
         for each in self.transforms.values():
             layout = each.arrange(layout, supply)
         return layout
@@ -34,7 +34,7 @@ class PerturbedEpisode(Episode):
 
 
 def sample_episode(spec: EpisodeSpec) -> PerturbedEpisode:
-    """Draw the suite's episode, then its perturbation; the same spec, the same episode."""
+    """Draw the suite's episode, then its perturbation; the same spec gives the same episode."""
     nominal = find_suite(spec.suite).sample(spec)
     perturbation = draw_perturbation(nominal)
     changed = {

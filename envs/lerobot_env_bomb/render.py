@@ -83,7 +83,7 @@ class CameraRenderer:
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._free = weakref.finalize(self, _free, self._gl, self._context, self._owner)
-        # At exit too, and before mujoco's own exit handler shuts OpenGL down: handlers run last in, first
+        # Freed at exit too, before mujoco's own exit handler shuts OpenGL down: handlers run last in, first
         # out, but weakref registers its one handler early.
         self._free.atexit = False
         atexit.register(self._free)
@@ -120,7 +120,7 @@ class CameraRenderer:
                 flags[flag] = False
         rgb = np.empty((size, size, 3), dtype=np.uint8)
         mujoco.mjr_readPixels(rgb, None, viewport, self._context)
-        shown = rgb[::-1].astype(np.int32) @ [1, 1 << 8, 1 << 16]  # numbers of what is drawn, from 1
+        shown = rgb[::-1].astype(np.int32) @ [1, 1 << 8, 1 << 16]  # numbers of the drawn geoms, from 1
         geoms = np.full(self._scene.ngeom + 1, -1, dtype=np.int32)
         for drawn in self._scene.geoms[: self._scene.ngeom]:
             if drawn.segid >= 0 and drawn.objtype == mujoco.mjtObj.mjOBJ_GEOM:
@@ -130,7 +130,7 @@ class CameraRenderer:
     def _render(self, data: mujoco.MjData, camera: str, size: int) -> mujoco.MjrRect:
         self._owner.check()
         self._gl.make_current()
-        # anew: after a neighbour has drawn with GLFW, the image of before would be read once more
+        # again: after another renderer has drawn with GLFW, the previous image would be read
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._camera.fixedcamid = self._model.camera(camera).id
         mujoco.mjv_updateScene(
@@ -158,7 +158,7 @@ def _free(gl: GLContext, context: mujoco.MjrContext, owner: _Owner) -> None:
 
 
 def _opengl_string(name: int) -> str | None:
-    """Return what the current OpenGL context says of itself."""
+    """Return a string that describes the current OpenGL context; None if it has none."""
     pointer: Any = GL_1_0.glGetString(name)
     text = ctypes.cast(pointer, ctypes.c_char_p).value
     return None if text is None else text.decode()

@@ -30,7 +30,7 @@ class Robot:
 
 
 def load_scara() -> mujoco.MjSpec:
-    """BOMB's scene with the SCARA arm."""
+    """Load BOMB's scene with the SCARA arm."""
     return mujoco.MjSpec.from_file(str(SCARA_XML))
 
 

@@ -90,7 +90,7 @@ class Scene:
         mujoco.mj_forward(self.model, self.data)
 
     def hold(self, stone: int, stone_xyz: np.ndarray, opening_m: float) -> None:
-        """Put a stone with its centre at (3,) metres between pads that are so far apart."""
+        """Put a stone with its centre at (3,) metres between pads that are ``opening_m`` apart."""
         adr = self._stone_qpos[stone]
         self.data.qpos[adr : adr + 3] = stone_xyz
         self.data.qpos[self._fingers] = opening_m / 2
@@ -111,7 +111,7 @@ class Scene:
         mujoco.mj_forward(self.model, self.data)
 
     def measure(self) -> SceneState:
-        """Poses and contacts now."""
+        """Return the current poses and contacts."""
         touched = np.zeros((NUM_STONES, 2), dtype=bool)
         stone_of_geom = {geom: i for i, geom in enumerate(self._stone_rims)}
         for geom1, geom2 in self.data.contact.geom:

@@ -17,7 +17,7 @@ from lerobot_bomb.bomb.observation import (
 )
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 
-# Bounds of what the simulator can report, metres. Stones can be flung off the board, so they are wide.
+# Bounds of what the simulator can report, metres. Stones can be flung off the board, so bounds are wide.
 POSITION_LIMIT_M = 100.0
 # Pads that scrape over the board at metres per second drag fingers past their soft stops: docs/bomb.md.
 GRIPPER_LIMIT_M = 1.0

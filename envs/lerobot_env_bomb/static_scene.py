@@ -13,7 +13,7 @@ from lerobot_bomb.bomb.suites.object import MARGIN_M
 
 HELD_RATE = 0.5  # of the scenes in which the fingers hold the stone that is meant
 NEAR_RATE = 0.4  # of the scenes in which the gripper is near a stone or a place
-NEAR_M = 0.025  # standard deviation of how near, in x and in y
+NEAR_M = 0.025  # standard deviation of its distance, in x and in y
 HEIGHT_M = (0.030, 0.140)  # of the gripper; clears stones that lie
 GRIP_ERROR_M = 0.0015  # largest of a held stone between the pads, in x, y and z
 
@@ -34,7 +34,7 @@ class StaticScene:
 
 
 def starting_scene(episode: Episode) -> StaticScene:
-    """The episode as it begins."""
+    """Return the scene at the start of an episode."""
     return StaticScene(episode.layout, num_made=0, held=None, held_xyz=np.zeros(3))
 
 
@@ -61,7 +61,7 @@ def draw_static(episode: Episode, rng: np.random.Generator) -> StaticScene:
 
 
 def _anywhere(layout: Layout, aim: Aim, is_held: bool, rng: np.random.Generator) -> np.ndarray:
-    """(3,) metres: in the workspace, or near a stone or a place."""
+    """Draw the gripper's position (3,) in metres: in the workspace, or near a stone or a place."""
     low, high = np.array(WORKSPACE_LOW_M[:2]), np.array(WORKSPACE_HIGH_M[:2])
     xy = rng.uniform(low, high)
     if rng.random() < NEAR_RATE:

@@ -11,7 +11,7 @@ from lerobot_env_bomb_libero.stock import get_libero_dummy_action
 
 
 class LiberoActuator:
-    """Actuator of one episode under `dynamics`; until the first arrives, the arm holds still."""
+    """Actuator of one episode under `dynamics`; until the first action arrives, the arm holds still."""
 
     def __init__(self, dynamics: LiberoDynamics, seed: int):
         self._noise = dynamics.noise

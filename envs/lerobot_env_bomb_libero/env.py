@@ -22,13 +22,13 @@ class _Run:
 
     episode: LiberoEpisode
     actuator: LiberoActuator | None  # None: actions are executed as they are
-    touched: set[str]  # what the gripper has met
+    touched: set[str]  # objects and fixtures that the gripper has touched
 
 
 class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
     """Task: the suite's, as LeRobot's `libero` has it.
 
-    Randomizations: which of the task's recorded initial states, by the seed. Without perturbations an
+    Randomizations: one of the task's recorded initial states, by the seed. Without perturbations an
     episode is LeRobot's of the same initial state and seed: images, states, rewards and end.
 
     Action: (7,) -1..1, the arm's relative motion in x, y, z and orientation, and the gripper, 1 to close.
@@ -117,7 +117,7 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
         return None if self._is_success else libero_failure_of(self._run.touched, self._scene.wanted)
 
     def _sensed(self, observation: Observation) -> Observation:
-        """LeRobot's observation with its images as the cameras' sensors take them in this step."""
+        """Return LeRobot's observation with its images as the cameras' sensors take them in this step."""
         sense = self._run.episode.perturbation.sense
         pixels = {name: sense(image, self._steps) for name, image in observation["pixels"].items()}
         return observation | {"pixels": pixels}

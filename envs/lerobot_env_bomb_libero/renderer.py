@@ -1,7 +1,7 @@
 """robosuite, imported so that it renders wherever MuJoCo does.
 
-It takes CUDA_VISIBLE_DEVICES for numbers of EGL's devices: it may hold UUIDs, or numbers of a machine whose
-container counts its own devices from 0.
+robosuite takes CUDA_VISIBLE_DEVICES for numbers of EGL's devices. But the variable may hold UUIDs, or numbers
+of a machine whose container counts its own devices from 0.
 """
 
 import os
@@ -26,7 +26,7 @@ def _all_gpus_visible() -> Iterator[None]:
 
 
 def or_mujocos(of_robosuite: Callable[[int], Any], of_mujoco: Callable[[], Any]) -> Callable[[int], Any]:
-    """Return EGL's display on robosuite's device or, if it finds none, on MuJoCo's.
+    """Return a function that makes EGL's display on robosuite's device or, if that fails, on MuJoCo's.
 
     MuJoCo takes the one of MUJOCO_EGL_DEVICE_ID, else the first that works.
     """

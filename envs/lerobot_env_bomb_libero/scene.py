@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false
-"""LeRobot's LIBERO environment with what the perturbation axes change of its MuJoCo model."""
+"""LeRobot's LIBERO environment, whose MuJoCo model the perturbation axes change."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ from lerobot_env_bomb_libero.stock import LiberoEnv, get_libero_dummy_action, mu
 CAMERAS = ("agentview", "robot0_eye_in_hand")
 ROBOT_PREFIXES = ("robot0_", "gripper0_", "mount0_")
 FINGERS = "gripper0_"
-# of mjModel, what the axes and LIBERO's own reset change
+# fields of mjModel that the axes and LIBERO's own reset change
 EDITED = (
     "body_pos", "body_quat", "body_mass", "body_inertia", "body_subtreemass", "body_invweight0",
     "dof_invweight0", "geom_rgba", "geom_friction", "geom_contype", "geom_conaffinity", "mat_rgba",
@@ -57,7 +57,7 @@ class LiberoScene(LiberoEnv):
         self._textures: dict[int, np.ndarray] = {}  # of those that were changed, as compiled
 
     def begin(self, seed: int, transforms: Sequence[LiberoTransform]) -> dict[str, Any]:
-        """Start a seed's episode; its first observation."""
+        """Start a seed's episode; return its first observation."""
         self._ensure_env()
         self._restore()
         env = self._built
@@ -139,7 +139,7 @@ class LiberoScene(LiberoEnv):
 
     @cached_property
     def scenery(self) -> np.ndarray:
-        """Geoms that are seen of table, floor and walls, as indices."""
+        """Indices of the visible geoms of table, floor and walls."""
         return np.flatnonzero((self.owners[self.model.geom_bodyid] == 0) & (self.model.geom_group == 1))
 
     def geoms_of(self, bodies: Sequence[int]) -> np.ndarray:
@@ -201,12 +201,12 @@ class LiberoScene(LiberoEnv):
         return [bodies[name] for name in sorted(self.wanted) if name in bodies]
 
     def gripper_xyz(self) -> np.ndarray:
-        """(3,) metres."""
+        """(3,) metres, position of the gripper."""
         return self.data.body("gripper0_eef").xpos.copy()
 
     @cached_property
     def _is_finger(self) -> np.ndarray:
-        """(bodies,) bool: which belong to the gripper."""
+        """(bodies,) bool: the body belongs to the gripper."""
         return np.array([self.model.body(body).name.startswith(FINGERS) for body in range(self.model.nbody)])
 
     @cached_property
@@ -215,7 +215,7 @@ class LiberoScene(LiberoEnv):
         return {body: name for name, body in (self.movable | self.fixtures).items()}
 
     def joints_of_robot(self) -> np.ndarray:
-        """(7,) where the arm's joints are in qpos."""
+        """(7,) indices of the arm's joints in qpos."""
         return np.array(self._built.robots[0]._ref_joint_pos_indexes)
 
     def _ensure_env(self) -> None:
@@ -234,7 +234,7 @@ class LiberoScene(LiberoEnv):
         inner._initialize_sim = initialize_and_remember
         inner.hard_reset = True
         self._place()
-        # from here on the model stays, and is set back: the same episodes for a fraction of the time
+        # from here on the model is kept and set back: the same episodes in a fraction of the time
         inner.hard_reset = False
         for camera in self.camera_name:
             observable = inner._observables[camera]
@@ -270,8 +270,8 @@ class LiberoScene(LiberoEnv):
         def draw(cache: Any) -> Any:
             if not self._draws:
                 return blank
-            # robosuite draws in whichever context is current: with several environments in one process,
-            # in that of the last one that was built
+            # robosuite draws in the current context: with several environments in one process, that of the
+            # last one that was built
             self._opengl.gl_ctx.make_current()
             return sensor(cache)
 

@@ -9,7 +9,7 @@ from lerobot_env_bomb_pusht.axes.dynamics import PushTDynamics
 
 
 class PushTActuator:
-    """Actuator of one episode under `dynamics`; until the first one arrives the agent stays."""
+    """Actuator of one episode under `dynamics`; until the first action arrives the agent stays."""
 
     def __init__(self, agent_xy: np.ndarray, dynamics: PushTDynamics, seed: int):
         self._noise_px = dynamics.noise_px

@@ -1,4 +1,4 @@
-"""gym-pusht's simulation with what the perturbation axes change of it."""
+"""gym-pusht's simulation, which the perturbation axes change."""
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -23,7 +23,7 @@ class PushTTransform(EpisodeTransform):
         """Change the board that gym-pusht has just set up, before block and agent are placed."""
 
     def arrange(self, state: np.ndarray) -> np.ndarray:
-        """(5,) agent's x, y, block's x, y in pixels and angle in radians -> the same after the change."""
+        """(5,) agent's x, y, block's x, y in pixels and angle in radians -> (5,) after the change."""
         return state
 
 
@@ -44,10 +44,10 @@ class Board(PushTEnv):
         self._transforms: Sequence[PushTTransform] = ()
         self.background: Callable[[pygame.Surface], None] | None = None  # draws it in place of white
         self.outline_px = 0  # width of a line around the target
-        self.touched = False  # whether the agent has met the block since the start
+        self.touched = False  # whether the agent has touched the block since the start
 
     def begin(self, seed: int, transforms: Sequence[PushTTransform]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start the episode of a seed; nothing of an earlier one is left, the drawn action neither."""
+        """Start the episode of a seed; nothing of an earlier one is left, not even the drawn action."""
         self._transforms, self._last_action = transforms, None
         observation, info = self.reset(seed=seed)
         self.touched = False
@@ -70,7 +70,7 @@ class Board(PushTEnv):
         super()._set_state(state)
 
     def _get_coverage(self) -> float:
-        """gym-pusht's, but of bar and stem in this order: in a set's, last bits differ between processes."""
+        """Compute gym-pusht's coverage, bar before stem: in a set's order, its last bits vary by process."""
         goal = pymunk_to_shapely(self.get_goal_pose_body(self.goal_pose), self._block_shapes)
         block = pymunk_to_shapely(self.block, self._block_shapes)
         return goal.intersection(block).area / goal.area
@@ -94,7 +94,7 @@ class Board(PushTEnv):
     def _get_img(
         self, screen: pygame.Surface, width: int, height: int, render_action: bool = False
     ) -> np.ndarray:
-        """gym-pusht's image, without the strided copy of the screen that takes nearly half of its reset."""
+        """Draw gym-pusht's image without its strided copy of the screen, nearly half of a reset's time."""
         if render_action:
             return super()._get_img(screen, width, height, render_action)
         import cv2

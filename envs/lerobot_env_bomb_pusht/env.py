@@ -132,6 +132,6 @@ class BombPushTEnv(EpisodeEnv[PushTSpec, _Run, PushTResult]):
         return pusht_failure_of(start, board.block_pose, board.goal_pose, self._coverage, board.touched)
 
     def _sensed(self, observation: Any) -> dict[str, Any]:
-        """gym-pusht's observation with its image as the camera's sensor takes it in this step."""
+        """Return gym-pusht's observation with its image as the camera's sensor takes it in this step."""
         pixels = self._run.episode.perturbation.sense(observation["pixels"], self._steps)
         return observation | {"pixels": pixels}

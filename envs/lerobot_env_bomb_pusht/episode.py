@@ -18,7 +18,7 @@ TEMPLATES = (
 
 @dataclass(frozen=True)
 class PushTEpisode:
-    """An episode under its condition; where block and agent start, gym-pusht draws from the seed."""
+    """An episode under its condition; gym-pusht draws from the seed where block and agent start."""
 
     spec: PushTSpec
     instruction: str

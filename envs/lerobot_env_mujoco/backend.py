@@ -11,7 +11,7 @@ PACKAGES = {"egl": "libegl1 libgl1", "osmesa": "libosmesa6"}  # headless ones, i
 PYOPENGL = {"egl": "EGLPlatform", "osmesa": "OSMesaPlatform"}  # classes of PyOpenGL
 PROBED = "LEROBOT_BOMB_PROBED_GL"  # environment variable: the backend that a parent process has tried
 PROBE_TIMEOUT_S = 60
-# without a display, GLFW makes a context, of which MuJoCo says only when it loads the functions that it lacks
+# without a display, GLFW makes a context; MuJoCo reports only later, on loading, that it lacks functions
 _PROBE = """
 import mujoco
 gl = mujoco.GLContext(16, 16)
@@ -23,7 +23,7 @@ gl.free()
 
 
 class NoOpenGLError(RuntimeError):
-    """MuJoCo cannot render on this machine."""
+    """Error that MuJoCo cannot render on this machine."""
 
 
 def probe(backend: str) -> str:
@@ -44,9 +44,9 @@ def probe(backend: str) -> str:
 def ensure_gl_backend() -> str:
     """Set MUJOCO_GL (and PYOPENGL_PLATFORM) to a backend that renders and return its name.
 
-    It is tried once, in the first process: child processes inherit it and lose no time. Off Linux, MuJoCo's
-    own default is kept. `mujoco.GLContext` is of this backend unless mujoco had been imported before;
-    `lerobot_env_mujoco.mujoco_gl.GLContext` always is.
+    A backend is tried once, in the first process: child processes inherit it and lose no time. Off Linux,
+    MuJoCo's own default is kept. `mujoco.GLContext` uses this backend unless mujoco was imported before;
+    `lerobot_env_mujoco.mujoco_gl.GLContext` always does.
 
     Raises:
         NoOpenGLError: no backend can render, or the one that MUJOCO_GL names cannot; the message names the
@@ -80,7 +80,7 @@ def ensure_gl_backend() -> str:
 
 
 def _check_pyopengl(backend: str) -> None:
-    """Raise a NoOpenGLError where PyOpenGL finds the functions of another backend."""
+    """Raise a NoOpenGLError if PyOpenGL was loaded for another backend."""
     loaded = sys.modules.get("OpenGL.platform")
     needed = PYOPENGL.get(backend)
     if loaded is None or needed in (None, (found := type(loaded.PLATFORM).__name__)):

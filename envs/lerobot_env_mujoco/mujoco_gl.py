@@ -1,6 +1,6 @@
 """MuJoCo and its OpenGL context, on a backend that renders. Every module here imports both from this one.
 
-Its names live in C modules that pyright cannot read.
+MuJoCo's names live in C modules that pyright cannot read.
 """
 
 import importlib

@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false
-"""Transforms that an axis draws for a compiled model, alike in every environment on MuJoCo."""
+"""Transforms of a compiled model, the same for every environment on MuJoCo."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class LightTransform(EpisodeTransform):
 
     @property
     def turn(self) -> np.ndarray:
-        """(3, 3) of a lamp's direction."""
+        """(3, 3) rotation of a lamp's direction."""
         return rotation(np.array(self.axis), self.angle_rad)
 
 
@@ -74,7 +74,7 @@ def least_distance(
 ) -> float:
     """Metres from a pivot at which a square image shows all (n, 3) offsets from it.
 
-    `margin`: share of half the image that they keep from its edge.
+    `margin`: share of half the image, from its edge to the nearest of them.
     """
     right, up, backward = camera_from_world @ offsets.T
     slope = np.tan(np.radians(fovy_deg) / 2) * (1 - margin)
@@ -82,7 +82,7 @@ def least_distance(
 
 
 def scale_mass(model: mujoco.MjModel, bodies: Sequence[int], factor: float) -> None:
-    """Scale the mass of free bodies of one part each, and all that the compiler computed from it."""
+    """Scale the mass of free bodies without children, and all that the compiler computed from it."""
     dofs = np.isin(model.dof_bodyid, bodies)
     for values in (model.body_mass, model.body_inertia, model.body_subtreemass):
         values[bodies] *= factor

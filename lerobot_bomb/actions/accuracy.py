@@ -1,4 +1,4 @@
-"""Accuracy of predicted numbers, token by token, from the true tokens before each (teacher forcing).
+"""Accuracy of predicted numbers under teacher forcing: the true tokens precede each predicted one.
 
 Shapes as in `lerobot_bomb.actions.text`; `M` = N * C + 1 columns, those of all numbers and the end token.
 """
@@ -18,9 +18,9 @@ def counted_numbers(numbers: NumberTokens) -> Tensor:
 
 
 def exact_numbers(numbers: NumberTokens, right_BM: Tensor) -> Tensor:
-    """(B, M) bool, the right token was predicted -> (B, N) bool, all of the number was, and that it ends."""
+    """(B, M) bool, tokens predicted correctly -> (B, N) bool, all tokens of the number and its end are."""
     right_BNC = right_BM[:, :-1].view_as(numbers.mask)
-    # a column after the number there is the next one's space or the end; where untrained, it cannot be wrong
+    # the column after a number is the next one's space or the end; if the loss skips it, it cannot be wrong
     loss_mask_BN = torch.cat(
         [numbers.loss_mask[:, 1:, 0], torch.ones_like(numbers.loss_mask[:, :1, 0])], dim=1
     )
@@ -29,7 +29,7 @@ def exact_numbers(numbers: NumberTokens, right_BM: Tensor) -> Tensor:
 
 
 def read_numbers(numbers: NumberTokens, digits_BM: Tensor) -> Tensor:
-    """(B, M) predicted digits -> (B, N) the numbers that they form, with as many digits as the true ones."""
+    """(B, M) predicted digits -> (B, N) the numbers that they form, each as long as the true number."""
     digits_BNW = digits_BM[:, :-1].view_as(numbers.mask)[..., 1:] * numbers.mask[..., 1:]
     place_values_W = 10 ** torch.arange(digits_BNW.shape[-1] - 1, -1, -1, device=digits_BM.device)
     return (digits_BNW * place_values_W).sum(dim=-1)
@@ -38,12 +38,12 @@ def read_numbers(numbers: NumberTokens, digits_BM: Tensor) -> Tensor:
 def means(
     parts: Mapping[str, tuple[Tensor, Tensor]], losses: Tensor, trained_batches: int
 ) -> dict[str, float]:
-    """{name: (values, which count)} -> {name: mean}, in one transfer from the device.
+    """{name: (values, mask of those that count)} -> {name: mean}, in one transfer from the device.
 
-    0 where nothing counts: LeRobot averages over processes by the names' order, so none may come and go.
+    A mean of nothing is 0: LeRobot averages over processes in the names' order, so no name may be missing.
 
     Raises:
-        ValueError: ``losses`` are not finite, after so many batches of training; they take the same transfer.
+        ValueError: ``losses``, which take the same transfer, are not finite.
     """
     sums = [torch.where(counted, values, 0).float().sum() for values, counted in parts.values()]
     counts = [counted.sum().clamp(min=1) for _, counted in parts.values()]

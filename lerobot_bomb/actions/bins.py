@@ -33,7 +33,7 @@ class Bins(nn.Module):
         """Values of any shape -> int64 indices in 0..num_bins - 1; values beyond [-1, 1] saturate.
 
         Raises:
-            ValueError: values on the CPU are not finite; on CUDA the host would wait.
+            ValueError: values on the CPU are not finite. On CUDA they are not checked: the host would wait.
         """
         require_finite_on_cpu(values, "what is written as a number")
         values = values.float().clamp(-1, 1)

@@ -1,4 +1,4 @@
-"""Temporal ensemble: an action as the mean of what several chunks foresaw for this step."""
+"""Temporal ensemble: the mean of the actions that several chunks predicted for one step."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ WEIGHTINGS = ("uniform", "exponential", "nvlabs", "adaptive")
 
 
 def age_weights(weighting: str, num_chunks: int, coefficient: float) -> Tensor:
-    """(num_chunks,) weights of chunks, the newest first, up to a factor.
+    """(num_chunks,) unnormalised weights of chunks, the newest first.
 
     ``uniform``: all alike (VLA-0, arXiv 2510.13054). ``exponential``: exp(coefficient * age), so a positive
     coefficient favours old chunks, as in ACT (arXiv 2304.13705), and -ln 2 halves the weight with every
@@ -26,11 +26,11 @@ def age_weights(weighting: str, num_chunks: int, coefficient: float) -> Tensor:
 
 
 class TemporalEnsemble:
-    """Weighted mean over the newest chunks; it predicts at every step.
+    """Weighted mean over the newest chunks, for a policy that predicts at every step.
 
-    ``adaptive`` weights an action by exp(coefficient * its cosine with the newest one), so a chunk of another
-    mind counts less (CogACT, arXiv 2411.19650). ``newest_only``: dimensions that are not averaged, such as a
-    gripper that is open or closed.
+    ``adaptive`` weights an action by exp(coefficient * its cosine with the newest one), so a chunk that
+    disagrees counts less (CogACT, arXiv 2411.19650). ``newest_only``: dimensions that are not averaged,
+    such as a gripper that is open or closed.
     """
 
     def __init__(self, size: int, weighting: str, coefficient: float, newest_only: Sequence[int] = ()):
@@ -52,7 +52,7 @@ class TemporalEnsemble:
         return action_BD
 
     def _weights(self, actions_BID: Tensor) -> Tensor:
-        """(B, I), or (1, I) where they are the same for all rows."""
+        """(B, I) weights; (1, I) if they are the same for all rows."""
         if self._weighting == "adaptive":
             return torch.exp(self._coefficient * cosine_similarity(actions_BID, actions_BID[:, :1], dim=2))
         weights_I = age_weights(self._weighting, actions_BID.shape[1], self._coefficient)

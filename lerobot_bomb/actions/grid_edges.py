@@ -1,4 +1,4 @@
-"""Polar coordinates; where one coordinate is cut, in float64, and what a bin stands for.
+"""Polar coordinates, and the bins of one coordinate: their edges and means, in float64.
 
 Shapes: `N` samples, `E` bins.
 """
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 MIN_WIDTH = 1e-4  # of a bin, in the coordinate's unit
-MARGIN = 0.01  # of a bin's width that a mean keeps from its edges, lest rounding moves it to the next bin
+MARGIN = 0.01  # least distance of a mean from its bin's edges, in bin widths: rounding leaves it inside
 
 
 @dataclass(frozen=True)
@@ -18,16 +18,16 @@ class Cut:
     """A coordinate's bins and the Gaussian of its samples."""
 
     edges: Tensor  # (E + 1,) increasing by at least MIN_WIDTH
-    means: Tensor  # (E,) of what is in each bin
+    means: Tensor  # (E,) mean value in each bin
     mean: float
     std: float
 
 
 def cut(values_N: Tensor, low: float, high: float, num_bins: int, distribution: str, min_sigma: float) -> Cut:
-    """Bins of [low, high] for the samples; without samples, of about equal width.
+    """Cut [low, high] into bins by the samples; without samples, into bins of about equal width.
 
     A standard deviation below `min_sigma` or MIN_WIDTH is raised to it: a coordinate that never changes has
-    its finest bins around its value. Means are those of the samples, or of the Gaussian in bins without any.
+    its finest bins around its value. A bin's mean is that of its samples, or of the Gaussian if it has none.
     """
     mean, std = (low + high) / 2, high - low
     if len(values_N):
@@ -47,7 +47,7 @@ def cut(values_N: Tensor, low: float, high: float, num_bins: int, distribution: 
 
 
 def gaussian_cut(mean: float, std: float, low: float, high: float, num_bins: int) -> Cut:
-    """Bins of [low, high] in which a Gaussian that is cut off at these ends has equal shares."""
+    """Cut [low, high] into bins with equal shares of a Gaussian that is truncated to it."""
     std = max(std, MIN_WIDTH)
     ends = torch.tensor([low, high], dtype=torch.float64)
     first, last = torch.special.ndtr((ends - mean) / std).tolist()
@@ -59,7 +59,7 @@ def gaussian_cut(mean: float, std: float, low: float, high: float, num_bins: int
 
 
 def _quantile_edges(values_N: Tensor, low: float, high: float, num_bins: int) -> Tensor:
-    """(E + 1,) with equal shares of the samples between them."""
+    """(E + 1,) edges with equal shares of the samples between them."""
     ranked_N = values_N.sort().values  # torch.quantile refuses more than 16 million values
     position = torch.linspace(0, len(values_N) - 1, num_bins + 1, dtype=torch.float64)
     below, above = ranked_N[position.floor().long()], ranked_N[position.ceil().long()]
@@ -78,7 +78,7 @@ def _separated(edges: Tensor) -> Tensor:
 def truncated_means(edges: Tensor, mean: float, std: float) -> Tensor:
     """(E + 1,) -> (E,): the mean of the Gaussian within each bin."""
     low, high = (edges[:-1] - mean) / std, (edges[1:] - mean) / std
-    # far out on the right, shares are differences of numbers near 1: mirror, so that they are small ones
+    # far out on the right, a share is a difference of numbers near 1; mirrored, of small ones
     mirrored = low > 0
     near, far = torch.where(mirrored, -high, low), torch.where(mirrored, -low, high)
     share = torch.special.ndtr(far) - torch.special.ndtr(near)
@@ -112,7 +112,7 @@ def from_polar(polar: Tensor) -> Tensor:
 
 
 def unrolled(angles: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
-    """Angles in (-pi, pi], in radians -> the same ones in [low, high], which is a whole turn."""
+    """Angles in (-pi, pi] -> the same angles in [low, high], which spans a whole turn; radians."""
     turn = 2 * math.pi
     return angles + turn * (angles < low).to(angles.dtype) - turn * (angles > high).to(angles.dtype)
 

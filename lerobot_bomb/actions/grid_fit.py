@@ -1,4 +1,4 @@
-"""Grids from data: what a dataset's actions are once normalised, and the cuts that they ask for.
+"""Grids from data: a dataset's normalised actions, and the cuts that fit them.
 
 Shapes: `N` samples, `D` action dims.
 """
@@ -14,13 +14,13 @@ from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings
 from lerobot_bomb.finite import require_finite_rows
 
 MIN_RHO = 1e-3  # a shorter motion has no direction to fit, where there is no bin for "no motion"
-REST_SHARE = 0.02  # of the long motions: what is shorter is "no motion", where no length is given
+REST_SHARE = 0.02  # of the length of long motions: a shorter motion is "no motion", unless a length is given
 LONG_MOTION = 0.95  # quantile of the motions' lengths
 EQUAL_BOUNDS = 1e-8  # LeRobot's width of a dimension whose bounds are equal
 
 
 def normalised(actions_ND: np.ndarray, low_D: np.ndarray, high_D: np.ndarray) -> np.ndarray:
-    """Actions -> float64 in which low is -1 and high is 1, as LeRobot's normaliser; not clipped."""
+    """Actions -> float64 in which low is -1 and high is 1, as in LeRobot's normaliser; not clipped."""
     width_D = np.where(high_D == low_D, EQUAL_BOUNDS, high_D - low_D)
     return 2 * (actions_ND.astype(np.float64) - low_D) / width_D - 1
 
@@ -95,9 +95,9 @@ def _shortest_motion(rho_N: Tensor, settings: GridSettings) -> float:
 
 
 def dead_radius(rho_N: Tensor) -> float:
-    """REST_SHARE of the data's long motions, in normalised units.
+    """Return REST_SHARE of the length of the data's long motions, in normalised units.
 
-    A share of the range would be one of the longest motion, and single frames would decide what rests.
+    A share of the range would depend on the longest motion, so single frames would decide what rests.
 
     Raises:
         ValueError: so few frames set the range that no bin is narrow enough for this.

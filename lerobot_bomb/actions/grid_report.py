@@ -15,10 +15,10 @@ from lerobot_bomb.actions.grids import ActionGrids
 
 CLIP_TOLERANCE = 1e-3  # LeRobot estimates quantiles: an extreme that many actions have may lie a hair beyond
 LINE_WIDTH = 110  # characters
-# of a dim's actions: what lies beyond the 1 % and 99 % quantiles, twice
+# share of a dim's actions; twice the share beyond the 1 % and 99 % quantiles
 MUCH_CLIPPED = 0.04
 MUCH_STOPPED = 0.5  # of the actions that move
-FEW_SET_RANGE = 10  # times the long motions that the longest is
+FEW_SET_RANGE = 10  # ratio of the longest motion to the long ones
 
 
 def coordinate_names(grids: ActionGrids, dim_names: Sequence[str]) -> list[str]:
@@ -27,12 +27,12 @@ def coordinate_names(grids: ActionGrids, dim_names: Sequence[str]) -> list[str]:
 
 
 def coordinate_edges(grids: ActionGrids) -> list[np.ndarray]:
-    """(bins + 1,) of each coordinate of all groups."""
+    """(bins + 1,) edges of each coordinate of all groups."""
     return [edges.numpy() for i in range(len(grids.groups)) for edges in grids.group_edges(i)]
 
 
 def edges_text(grids: ActionGrids, dim_names: Sequence[str]) -> str:
-    """Lines of edges, coordinate by coordinate."""
+    """Write the edges of each coordinate, as lines of text."""
     labels = coordinate_names(grids, dim_names)
     lines = [
         f"{label}: {' '.join(f'{edge:.4f}' for edge in edges)}"
@@ -69,7 +69,7 @@ def clipping_text(actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str
 
 
 def rest_text(grids: ActionGrids, actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str, bool]:
-    """Describe how many normalised actions a cell of no motion takes, and whether that needs a remedy.
+    """Describe how many normalised actions the "no motion" cells take, and whether that needs a remedy.
 
     The text is empty if there is no such cell.
     """
@@ -113,7 +113,7 @@ def _group_rest_text(rho_N: np.ndarray, is_still_N: np.ndarray, dead: float) -> 
 
 
 def cells_text(groups: Collection[ActionGroup]) -> str:
-    """A token for each group, and how many cells it chooses from."""
+    """Describe the tokens of an action, and how many cells each chooses from."""
     cells = ", ".join(
         f"{group.transform} " * (group.transform != "identity") + " x ".join(map(str, group.bins))
         for group in groups

@@ -14,8 +14,8 @@ from lerobot_bomb.actions.grids import ActionGrids
 def interpolate_rows(old: ActionGrids, new: ActionGrids, rows: Tensor) -> Tensor:
     """A row per cell of the old grid (V, H) -> a row per cell of the new one (V', H), in the rows' type.
 
-    Linear along each coordinate between the middles of the old bins, constant beyond the outermost; phi goes
-    round. Binary groups stay unchanged, and the new cell of "no motion" takes the row of the old one.
+    Linear along each coordinate between the middles of the old bins, constant beyond the outermost; phi wraps
+    around. Binary groups stay unchanged, and the new cell of "no motion" takes the row of the old one.
 
     Raises:
         ValueError: the groups differ in dims or transform, or there are not as many rows as old cells.
@@ -63,7 +63,7 @@ def _middles(edges: Tensor) -> Tensor:
 
 
 def _move_around(lattice: Tensor, axis: int, old: Tensor, new: Tensor) -> Tensor:
-    """`_move_axis` for angles, in radians, of whose bins the first is the last one's neighbour."""
+    """`_move_axis` for angles in radians, whose first and last bins are neighbours."""
     turn = 2 * math.pi
     old = torch.cat([old[-1:] - turn, old, old[:1] + turn])
     ends = lattice.narrow(axis, -1, 1), lattice.narrow(axis, 0, 1)

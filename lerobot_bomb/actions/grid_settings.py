@@ -16,12 +16,12 @@ TRANSFORMS = ("polar", "identity", "binary")
 POLAR_COORDINATES = ("theta", "phi", "rho")
 POLAR_BINS = (16, 32, 8)
 LINEAR_BINS = 16
-JOINT_BINS = 256  # of one joint a token: 16 x 16 x 16 for three joints leave errors of degrees
+JOINT_BINS = 256  # one joint per token: 16 x 16 x 16 for three joints leave errors of degrees
 MAX_BINS = 4096  # of a coordinate
 LAYOUTS = ("pose", "joints")
 FLAG = "--policy.action_groups"
 LAYOUT_FLAG = "--policy.action_layout"
-# flags of the policy that are called otherwise than the field of `GridSettings`
+# policy flags whose names differ from the fields of `GridSettings`
 FLAG_NAMES = {"groups": "action_groups", "distribution": "grid_distribution", "min_sigma": "grid_min_sigma"}
 
 
@@ -70,18 +70,19 @@ class ActionGroup:
 def default_groups(
     num_dims: int, names: Sequence[str] | None = None, layout: str | None = None
 ) -> tuple[ActionGroup, ...]:
-    """Groups for actions of these dims.
+    """Return the default groups of an action.
 
-    A pose has SpatialVLA's: direction and length of x, y, z, then three angles and a binary gripper (7 dims)
-    or a gripper in `LINEAR_BINS` (4). Two dims share a token; of all others each is one of `JOINT_BINS`.
+    A pose has SpatialVLA's groups: direction and length of x, y, z, then three angles and a binary gripper
+    (7 dims) or a gripper in `LINEAR_BINS` (4). Two dims share a token. Otherwise each dim is a token of
+    `JOINT_BINS`.
 
     Args:
-        num_dims: of the action.
-        names: of its dims, which tell whether it is a pose; numbers alone tell nothing.
-        layout: of `LAYOUTS`, whatever the names are.
+        num_dims: number of action dims.
+        names: names of the dims, which tell whether the action is a pose.
+        layout: one of `LAYOUTS`; overrides the names.
 
     Raises:
-        ValueError: there is no such pose, or 7 dims may be a pose or seven joints.
+        ValueError: no pose has so many dims, or 7 dims may be a pose or seven joints.
     """
     layout = layout or _named_layout(num_dims, list(names or []))
     if layout == "pose":
@@ -176,5 +177,5 @@ class GridSettings:
         return json.loads(json.dumps(asdict(self)))
 
     def flags(self) -> dict[str, Any]:
-        """{flag of the policy: value} that ask for this grid."""
+        """{policy flag: value} that request this grid."""
         return {FLAG_NAMES.get(name, name): value for name, value in self.to_dict().items()}

@@ -26,17 +26,17 @@ class ActionGrids(nn.Module):
     """Actions in [-1, 1] (..., D) <-> a cell per group (..., G).
 
     Polar coordinates are taken around `rest`, the normalised action that means "no motion". Until `fit`, bins
-    are of about equal width around 0. Buffers stay float32, to whatever type the module is cast; they are in
-    no `state_dict`, but in `to_dict`, which a checkpoint's config holds.
+    are of about equal width around 0. Buffers stay float32 whatever type the module is cast to. They are in
+    no `state_dict`; a checkpoint's config holds them, as `to_dict` returns them.
     """
 
     edges: Tensor  # (C, E + 1) of the bins, increasing; rows of fewer bins end with inf
     gaussians: Tensor  # (C, 2) mean and standard deviation of the samples
-    means: Tensor  # (C, E) of what is in each bin
+    means: Tensor  # (C, E) mean value in each bin
     centroids: Tensor  # (V, P) mean action of the samples in each cell; from `means` where there are none
     rest: Tensor  # (D,)
     _dims: Tensor  # (D,) int64, the groups' dims one after the other
-    _order: Tensor  # (D,) int64, where each dim is among these
+    _order: Tensor  # (D,) int64, position of each dim in `_dims`
     _last_bin: Tensor  # (C, 1) int64
 
     def __init__(self, settings: GridSettings, num_dims: int):
@@ -49,7 +49,7 @@ class ActionGrids(nn.Module):
         self.num_cells = [group.num_cells for group in self.groups]
         *self.offsets, self.num_tokens = accumulate(self.num_cells, initial=0)
         self.bins = [bins for group in self.groups for bins in group.bins]
-        # of each group, among the coordinates and among the groups' dims
+        # slice of each group among the coordinates, and among the groups' dims
         self._rows = _slices(len(group.bins) for group in self.groups)
         self._columns = _slices(len(group.dims) for group in self.groups)
         num_coordinates, finest = len(self.bins), max(self.bins)
@@ -70,35 +70,36 @@ class ActionGrids(nn.Module):
         self._set(fit_cuts(torch.zeros(0, num_dims, dtype=torch.float64), rest_D, settings), rest_D)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Follow to another device, but not to another type: in bfloat16 edges would coincide."""
+        """Move buffers to another device, but not to another type: in bfloat16 edges would coincide."""
         return super()._apply(lambda tensor: tensor.to(fn(tensor[:0]).device), recurse)
 
     # Actions and cells
 
     def encode(self, actions: Tensor) -> Tensor:
-        """(..., D) -> (..., G) int64, within each group; actions beyond [-1, 1] are clipped.
+        """Actions (..., D) -> cells (..., G) int64, counted in each group; actions are clipped to [-1, 1].
 
         Raises:
-            ValueError: they have other dims or, on the CPU, are not finite; on CUDA the host would wait.
+            ValueError: the number of dims is wrong or, on the CPU, an action is not finite. On CUDA this is
+                not checked: the host would wait.
         """
         require_finite_on_cpu(actions, "an action that is put into a grid")
         self._check_dims(actions.shape[-1])
         values_CN = self.coordinates(actions.to(self.edges.dtype).clamp(-1, 1)).reshape(-1, len(self.bins)).T
-        # bins are closed on the left: the number of edges up to the value, but for the first
+        # bins are closed on the left: a bin's index is the number of edges up to the value, less the first
         bins_CN = torch.searchsorted(self.edges[:, 1:].contiguous(), values_CN.contiguous(), right=True)
         bins_CN = torch.minimum(bins_CN, self._last_bin)
         cells = [self._cell(i, bins_CN[rows]) for i, rows in enumerate(self._rows)]
         return torch.stack(cells, dim=-1).view(*actions.shape[:-1], len(self.groups))
 
     def decode(self, cells: Tensor, point: str | None = None) -> Tensor:
-        """(..., G) -> (..., D) float32 in [-1, 1]; ``point``: another decode point than the grid's."""
+        """Cells (..., G) -> (..., D) float32 in [-1, 1]; ``point`` replaces the grid's decode point."""
         parts = [self.decode_group(i, cells[..., i], point) for i in range(len(self.groups))]
         return torch.cat(parts, dim=-1)[..., self._order]
 
     def decode_group(self, index: int, cells: Tensor, point: str | None = None) -> Tensor:
         """Cells (...) of one group -> its dims (..., P of the group), float32 in [-1, 1].
 
-        ``point``: another decode point than the grid's.
+        ``point`` replaces the grid's decode point.
         """
         point = point or self.decode_point
         group, rows = self.groups[index], self._rows[index]
@@ -120,7 +121,7 @@ class ActionGrids(nn.Module):
         return values.clamp(-1, 1)
 
     def coordinates(self, actions: Tensor) -> Tensor:
-        """(..., D) -> what is cut into bins (..., C), phi within its edges; polar angles in radians."""
+        """Actions (..., D) -> coordinates (..., C), phi within its edges; polar angles in radians."""
         actions, rest, parts = actions[..., self._dims], self.rest[self._dims], []
         for group, rows, columns in zip(self.groups, self._rows, self._columns, strict=True):
             values = actions[..., columns]
@@ -133,7 +134,7 @@ class ActionGrids(nn.Module):
         return torch.cat(parts, dim=-1)
 
     def _cell(self, index: int, bins: Tensor) -> Tensor:
-        """(coordinates of a group, N) -> (N,)."""
+        """Bins (coordinates of the group, N) -> cells (N,)."""
         group = self.groups[index]
         cells = torch.zeros_like(bins[0])
         for indices, num_bins in zip(bins, group.bins, strict=True):
@@ -144,7 +145,7 @@ class ActionGrids(nn.Module):
         return self.settings.zero_radius_bin and group.transform == "polar"
 
     def _midpoints(self) -> Tensor:
-        """(C, E); the rows of fewer bins end with inf."""
+        """(C, E) middles of the bins; rows of fewer bins end with inf."""
         return (self.edges[:, :-1] + self.edges[:, 1:]) / 2
 
     def _check_dims(self, num_dims: int) -> None:
@@ -155,12 +156,12 @@ class ActionGrids(nn.Module):
 
     @torch.no_grad()
     def fit(self, actions_ND: np.ndarray | Tensor, rest_D: np.ndarray | None = None) -> None:
-        """Take the cells from normalised actions, clipped to [-1, 1].
+        """Fit the cells to normalised actions, clipped to [-1, 1].
 
         ``rest_D``: the normalised action that means "no motion", clipped to [-1, 1]; zeros if not given.
 
         Raises:
-            ValueError: there are no actions, of another size, or some are not finite.
+            ValueError: there are no actions, their size is wrong, or some are not finite.
         """
         actions_ND = check_actions(actions_ND)
         self._check_dims(actions_ND.shape[1])
@@ -177,9 +178,9 @@ class ActionGrids(nn.Module):
         decode_point: str = "cond_mean",
         groups: tuple[ActionGroup, ...] | None = None,
     ) -> Self:
-        """The grid of SpatialVLA's gs_*.json, of actions of 7 dims; the original decodes to "mid".
+        """Build the grid of SpatialVLA's gs_*.json, for 7 action dims; the original decodes to "mid".
 
-        Its gripper, 0 closed and 1 open, is -1 and 1 here.
+        Its gripper is 0 closed and 1 open; here these are -1 and 1.
         """
         if missing := [key for key in PUBLISHED_KEYS if key not in parameters]:
             raise ValueError(f"the published grid lacks {', '.join(missing)}; it has {', '.join(parameters)}")
@@ -214,7 +215,7 @@ class ActionGrids(nn.Module):
         return [row[: bins + 1] for row, bins in zip(edges, self.bins[rows], strict=True)]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the grid as JSON values, to the bit; centroids, which are many, only if decoded to."""
+        """Return the grid as JSON values, bit for bit; the many centroids only if it decodes to them."""
         fitted = {
             "edges": [row[: bins + 1].tolist() for row, bins in zip(self.edges, self.bins, strict=True)],
             "means": [row[:bins].tolist() for row, bins in zip(self.means, self.bins, strict=True)],
@@ -228,7 +229,7 @@ class ActionGrids(nn.Module):
 
     @classmethod
     def from_dict(cls, parameters: dict[str, Any], num_dims: int) -> Self:
-        """The grid of `to_dict` for actions of ``num_dims`` dims."""
+        """Build the grid that `to_dict` returned, for actions of ``num_dims`` dims."""
         grids = cls(GridSettings.from_dict(parameters["settings"]), num_dims)
         rows = (parameters[key] for key in ("edges", "means", "gaussians"))
         cuts = [
@@ -259,7 +260,7 @@ class ActionGrids(nn.Module):
         self._set_centroids(torch.zeros(0, self.num_dims, dtype=torch.float64))
 
     def _set_centroids(self, actions_ND: Tensor) -> None:
-        """Set each cell's centroid to the mean of its samples; without samples, to that of `means`."""
+        """Set each cell's centroid to the mean of its samples; without samples, to its point of `means`."""
         self.centroids.copy_(self._cond_means())
         cells_NG = self.encode(actions_ND.to(self.edges.device)).cpu()
         for i, group in enumerate(self.groups):
@@ -272,7 +273,7 @@ class ActionGrids(nn.Module):
             self.centroids[rows, : len(group.dims)] = means
 
     def _cond_means(self) -> Tensor:
-        """(V, P) float32."""
+        """(V, P) float32: the action of each cell at the means of its bins."""
         means = torch.zeros_like(self.centroids)
         for i, (first, num_cells) in enumerate(zip(self.offsets, self.num_cells, strict=True)):
             cells = torch.arange(num_cells, device=means.device)

@@ -19,7 +19,7 @@ BOUND_STATISTICS = {
     NormalizationMode.QUANTILE10: ("q10", "q90"),
 }
 CENTRE_AND_DISTANCE = ("mean", "std")
-QUANTILE = 0.999  # of the residuals' sizes; where normalised values are bounded, what lies beyond saturates
+QUANTILE = 0.999  # of the residuals' sizes; larger ones saturate where normalised values are bounded
 MAX_RESIDUALS = 20_000_000  # a dimension; of more, evenly spaced frames are taken
 
 
@@ -29,7 +29,7 @@ def bounds(
     """(D,) values that become -1 and (D,) values that become 1 when LeRobot normalises.
 
     Raises:
-        ValueError: the dataset has no such statistics, or they are not finite.
+        ValueError: the dataset lacks the statistics of the mode, or they are not finite.
     """
     if mode is NormalizationMode.IDENTITY:
         return -np.ones(num_dims), np.ones(num_dims)
@@ -87,11 +87,11 @@ class RelativeActions(nn.Module):
         self.register_buffer("scale", 1 + relative)  # two values in [-1, 1] differ by at most 2
 
     def encode(self, actions_BTD: Tensor, state_BS: Tensor) -> Tensor:
-        """Absolute -> relative."""
+        """Absolute actions (B, T, D) -> residuals (B, T, D) to the state (B, S)."""
         return (actions_BTD - self._anchor(state_BS)) / self.scale
 
     def decode(self, residuals_BTD: Tensor, state_BS: Tensor) -> Tensor:
-        """Relative -> absolute."""
+        """Residuals (B, T, D) to the state (B, S) -> absolute actions (B, T, D)."""
         return residuals_BTD * self.scale + self._anchor(state_BS)
 
     def _anchor(self, state_BS: Tensor) -> Tensor:
@@ -136,7 +136,7 @@ class RelativeActions(nn.Module):
 def _require_tracking(
     actions_N: np.ndarray, states_N: np.ndarray, episode_ends_N: np.ndarray, dim: int, state_dim: int
 ) -> None:
-    """Raise unless the action varies less around the state, or the state that follows, than by itself."""
+    """Raise a ValueError unless the action varies less around this or the next state than by itself."""
     following_N = np.minimum(np.arange(len(states_N)) + 1, episode_ends_N - 1)
     spread = float(actions_N.std())
     distance = min(float((actions_N - followed_N).std()) for followed_N in (states_N, states_N[following_N]))

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 NUM_SYMBOLS = 12
 SPACE, END = 10, 11
-SYMBOL_TEXTS = (*"0123456789", " ")  # the end's is the chat format's
+SYMBOL_TEXTS = (*"0123456789", " ")  # the chat format defines the end's
 MAX_DIGITS = 4  # of any number that a policy reads or writes
 
 IGNORED = -100  # label of a token that the loss does not count
@@ -21,7 +21,7 @@ MASK_LEVELS = ("value", "step", "char")
 
 
 def digits_needed(num_values: int) -> int:
-    """Digits of the largest of ``num_values`` numbers that start at 0."""
+    """Number of digits that the numbers from 0 to ``num_values`` - 1 need."""
     return len(str(num_values - 1))
 
 
@@ -48,7 +48,7 @@ class NumberTokens:
     loss_mask: Tensor  # bool
 
     def hide_numbers(self, hidden_BN: Tensor, hidden_id: int) -> "NumberTokens":
-        """One ``hidden_id`` in place of all digits of a number; its space stays and is trained on."""
+        """Put one ``hidden_id`` in place of a hidden number's digits; its space stays and is trained on."""
         ids_BNC, mask_BNC, loss_mask_BNC = self.ids.clone(), self.mask.clone(), self.loss_mask.clone()
         mask_BNC[..., 1:-1] &= ~hidden_BN[..., None]
         loss_mask_BNC[..., 1:] &= ~hidden_BN[..., None]
@@ -56,7 +56,7 @@ class NumberTokens:
         return NumberTokens(ids_BNC, mask_BNC, loss_mask_BNC)
 
     def hide_characters(self, hidden_BNC: Tensor, hidden_id: int) -> "NumberTokens":
-        """``hidden_id`` in place of single digits and spaces."""
+        """Put ``hidden_id`` in place of single digits and spaces."""
         ids_BNC = self.ids.masked_fill(hidden_BNC, hidden_id)
         return NumberTokens(ids_BNC, self.mask, self.loss_mask & ~hidden_BNC)
 
@@ -80,7 +80,7 @@ def draw_hidden(
 
 
 def compact(mask_BL: Tensor, *columns_BL: Tensor) -> tuple[Tensor, ...]:
-    """Move the written columns of every row to the front, order kept; cut columns no row needs.
+    """Move the written columns of every row to the front, in order; drop columns that no row needs.
 
     Returns ``mask_BL`` and each of ``columns_BL`` rearranged, (B, longest row).
     """
@@ -125,7 +125,7 @@ class TokenRows:
         return TokenRows(*(nn.functional.pad(columns, (0, width)) for columns in self._columns))
 
     def without_padding(self) -> "TokenRows":
-        """Rows that start with their tokens."""
+        """Move the tokens of each row to its front."""
         mask_BL, ids_BL, *hidden = compact(self.mask, self.ids, *self._columns[2:])
         return TokenRows(ids_BL, mask_BL, *hidden)
 
@@ -159,6 +159,6 @@ class Answer:
         return cls(TokenRows(ids_BA, mask_BA), labels_BA, columns_BA)
 
     def with_padding(self, values_BA: Tensor, numbers: NumberTokens) -> Tensor:
-        """Values of the tokens back at their columns, (B, M); undefined in padding."""
+        """Put the tokens' values (B, A) back at their columns (B, M); undefined in padding."""
         values_BM = values_BA.new_zeros(len(values_BA), numbers.mask[0].numel() + 1)
         return values_BM.scatter(1, self.columns, values_BA)

@@ -1,4 +1,4 @@
-"""The board, its intersections and its stones; numpy only, as all that simulator workers import."""
+"""The board, its intersections and its stones; imports only numpy, as all that simulator workers load."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

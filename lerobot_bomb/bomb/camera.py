@@ -7,7 +7,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """A pinhole camera of an image."""
+    """Intrinsics and pose of the camera that took an image."""
 
     intrinsics: np.ndarray  # (3, 3) pixels; the centre of the top left pixel is (0, 0)
     world_from_camera: np.ndarray  # (4, 4) metres; camera axes x right, y down, z forward

@@ -30,7 +30,7 @@ SUPPLY_SPREAD_M = 0.001
 NUM_SUPPLY_BESIDE_PATTERN = 6  # of these places, those that leave room for the small board
 # where the expert puts stones that it takes off the board
 TRAY_XY_M = tuple((TRAY_CENTER_XY[0], y) for y in (0.0, 0.046, -0.046, 0.092, -0.092))
-NUM_PARTS = 5  # one in so many of what a command can be about is held out
+NUM_PARTS = 5  # one in so many of the arguments of a command is held out
 
 TEMPLATES = ("{Command}.", "Please {command}.", "Your task: {command}.", "Now {command}.")
 FORMS = (
@@ -56,7 +56,7 @@ FORMS = (
 class TaskInstance:
     """Board, tray and command that are drawn for an episode of a task."""
 
-    about: tuple[int, ...]  # numbers of what the command is about: colours, rows, directions
+    about: tuple[int, ...]  # the command's arguments, as numbers: colours, rows, directions
     stones: Stones  # on the board
     supply: tuple[str, ...] = ()  # colours of the stones in the tray, row by row from the far one
     pattern: Stones = field(default_factory=dict)  # on the small board
@@ -77,7 +77,7 @@ class Case:
 
 
 class Task(ABC):
-    """A verb."""
+    """A verb, whose arguments are drawn for each episode."""
 
     @abstractmethod
     def draw(self, rng: np.random.Generator) -> TaskInstance:
@@ -95,7 +95,7 @@ def is_graspable(stones: Stones, intersection: Intersection) -> bool:
 
 
 def other_color(color: str) -> str:
-    """Black's is white, white's is black."""
+    """Return white for black, and black for white."""
     return COLORS[1 - COLORS.index(color)]
 
 
@@ -126,12 +126,12 @@ def draw_stones(
 
 
 def is_heldout(task_id: int, about: tuple[int, ...]) -> bool:
-    """Return True if a command is held out; each of its verbs, colours, rows, ... occurs in others."""
+    """Return True if a command is held out; its verb and each of its arguments occur in others."""
     return (task_id + sum(place * number for place, number in zip(count(1), about))) % NUM_PARTS == 0
 
 
 def command_suite(tasks: Sequence[Task], max_steps: int, num_goals: int, version: str) -> Suite:
-    """A suite whose numbered tasks are verbs."""
+    """Build a suite whose numbered tasks are verbs."""
     return Suite(
         partial(_sample, tasks),
         lambda spec: refuse_options(spec, "target", "color"),
@@ -157,7 +157,7 @@ def draw_command(tasks: Sequence[Task], spec: EpisodeSpec) -> tuple[int, TaskIns
 
 
 def _sample(tasks: Sequence[Task], spec: EpisodeSpec) -> Episode:
-    """Draw verb, board, command and start; the same spec, the same episode."""
+    """Draw verb, board, command and start; the same spec gives the same episode."""
     refuse_options(spec, "target", "color")
     task_id, drawn, case = draw_command(tasks, spec)
     template = draw_template(spec, TEMPLATES)
@@ -186,7 +186,7 @@ def _means(task: Task, drawn: TaskInstance, case: Case, stones: Stones) -> bool:
 
 
 def _layout(seed: int, drawn: TaskInstance) -> Layout:
-    """The supply in the tray, the gripper above it, and an empty board."""
+    """Draw the supply in the tray and the gripper above it; the board is empty."""
     gripper, supply = generator(seed, Stream.GRIPPER), generator(seed, Stream.SUPPLY)
     gripper_xyz = np.array([*TRAY_CENTER_XY, gripper.uniform(*GRIPPER_START_HEIGHT_M)])
     gripper_xyz[:2] += gripper.uniform(-GRIPPER_START_SPREAD_M, GRIPPER_START_SPREAD_M, 2)

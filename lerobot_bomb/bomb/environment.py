@@ -12,15 +12,15 @@ from lerobot_bomb.bomb.suites import OWN_SUITES
 from lerobot_bomb.compat.help import leave_out_of_help
 from lerobot_bomb.conditions import ALL
 
-SUITE = "SUITE"  # in flags: one that is not known, to be filled in
+SUITE = "SUITE"  # stands in flags for an unknown suite, to be filled in
 IMAGES, DEPTH = "observation.images.", "observation.depth."
-# what an observation or an action means depends on; --env.NAME changes it
+# the meaning of an observation or an action depends on these; --env.NAME changes them
 COMPARED = ("task", "robot", "control_mode", "fps", "image_size")
 
 
 @dataclass(frozen=True)
 class Environment:
-    """A policy may act under another depth, split or numbered task than these; perturbations do not count."""
+    """BOMB's settings but perturbations. A policy may act under another depth, split or numbered task."""
 
     robot: str
     control_mode: str
@@ -40,12 +40,12 @@ class Environment:
     def of_dataset(
         cls, info: Mapping[str, Any], task: str | None, task_ids: tuple[int, ...] | None
     ) -> "Environment | None":
-        """Return the environment that a dataset shows; None if it shows no such environment.
+        """Return the environment of a dataset; None if it was not recorded in BOMB.
 
         Args:
             info: LeRobot's info.json, which stays true when a dataset is merged or edited.
-            task: suite or suites, of which info.json says nothing.
-            task_ids: numbered tasks, of which it says nothing either.
+            task: suite or suites, which info.json does not name.
+            task_ids: numbered tasks, which info.json does not name either.
         """
         robot = re.fullmatch(r"bomb_(\w+)_v([\d.]+)", str(info.get("robot_type")))
         features: dict[str, Any] = info.get("features", {})
@@ -69,11 +69,11 @@ class Environment:
 
     @property
     def suites(self) -> frozenset[str] | None:
-        """Suites that it shows; None if unknown."""
+        """Suites of the recording; None if unknown."""
         return None if self.task is None else _suites(self.task)
 
     def _flag(self, name: str) -> str:
-        """Return a flag of lerobot-eval; of several suites it names the first, unless they are all."""
+        """Return a flag of lerobot-eval; for several suites it names the first, unless they are all."""
         value = getattr(self, name)
         if name == "task" and self.suites is not None:
             value = ALL if self.suites == frozenset(OWN_SUITES) else min(self.suites)
@@ -106,11 +106,11 @@ class Environment:
 
     @property
     def _is_current(self) -> bool:
-        """Return True if its suites are in today's versions."""
+        """Return True if all suites have their current versions."""
         return self.suites is not None and self.task_version == _current_version(self.suites)
 
     def check_same(self, other: "Environment", who: str, override: str) -> None:
-        """Raise a ValueError, which names flags to change, unless `who`, trained here, can act in `other`."""
+        """Raise a ValueError, naming flags to change, unless `who`, trained here, can act in `other`."""
         names = self.differences(other)
         if not names:
             return
@@ -140,9 +140,10 @@ class Environment:
 
 
 def robot_type(robot: str, task: str) -> str:
-    """Return what a recording's info.json calls a robot: with the newest version of all suites and its own.
+    """Return `robot_type` of a recording's info.json: its robot and a version.
 
-    LeRobot merges only datasets of one robot: recordings of several suites, but none of older tasks.
+    The version is the newest of our suites and the recording's. LeRobot merges only datasets of one
+    `robot_type`: recordings of several suites, but none of older tasks.
     """
     return f"bomb_{robot}_v{max(map(task_version, (ALL, task)))}"
 

@@ -10,8 +10,8 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import NONE, PerturbedSpec
 from lerobot_bomb.flags import one_of
 
-# Version of how a policy is measured and what a record says. 1.1 is 1.0 with records that name
-# simulator, policy and tasks. A suite has a version of its own, of what its episodes are: `bomb/suite.py`.
+# Version of the measurement of a policy and of the records. 1.1 is 1.0 with records that name simulator,
+# policy and tasks. A suite has a version of its own, for its episodes: `bomb/suite.py`.
 PROTOCOL_VERSION = "1.1"
 
 ROBOTS = ("scara", "fetch")
@@ -20,7 +20,7 @@ SPLITS = ("all", "train", "heldout")
 
 DEFAULT_FPS = 10  # control steps per second
 PHYSICS_HZ = 200  # physics steps per second; a multiple of the control rate
-MAX_SEED = 2**32 - 1  # what LeRobot seeds NumPy with
+MAX_SEED = 2**32 - 1  # the largest seed that NumPy accepts from LeRobot
 TEST_SEEDS = range(1000, 1200)  # of evaluations: from LeRobot's default on, as many as the protocol asks for
 
 
@@ -49,7 +49,7 @@ class Failure(StrEnum):
 
 
 def check_seed(seed: int) -> None:
-    """Raise a ValueError unless LeRobot can seed with it."""
+    """Raise a ValueError unless LeRobot can use this seed."""
     if not 0 <= seed <= MAX_SEED:
         raise ValueError(f"--seed={seed} must lie in 0..{MAX_SEED}")
 
@@ -105,5 +105,5 @@ class EpisodeSpec(PerturbedSpec):
             )
 
     def to_dict(self) -> dict[str, object]:
-        """JSON-ready dict."""
+        """Return the spec as values that JSON can hold."""
         return dataclasses.asdict(self)

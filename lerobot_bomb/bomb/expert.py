@@ -15,13 +15,13 @@ from lerobot_bomb.bomb.episode import DEFAULT_FPS
 from lerobot_bomb.bomb.observation import MAX_STEP_M, WORKSPACE_HIGH_M, WORKSPACE_LOW_M
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 
-SPEED_M_S = 0.30  # at most, along each of the horizontal plane and the vertical
+SPEED_M_S = 0.30  # at most, horizontally and vertically each
 GAIN = 0.75  # share of the remaining way that a step of 0.1 s covers near its goal
 
 GRASP_DEPTH_M = 0.0028  # of the pads' lower ends below the stone's centre
 GRASP_SLACK_M = 0.004  # that a held stone may sit too high between the pads
-FLOOR_M = WORKSPACE_LOW_M[2] + 0.0007  # lowest height asked of the gripper
-PRESS_M = 0.0015  # below its goal: where a descent aims, lest its last millimetre take for ever
+FLOOR_M = WORKSPACE_LOW_M[2] + 0.0007  # lowest height commanded to the gripper
+PRESS_M = 0.0015  # how far below its goal a descent aims, as it slows down near its aim
 RETREAT_HEIGHT_M = 0.11  # of the gripper after the release
 
 # Finger openings.
@@ -48,7 +48,7 @@ RELEASE_LATERAL_M = (0.0040, 0.0070)  # a stone this near is in place: in closed
 RELEASE_HEIGHT_M = (0.0025, 0.0040)
 SLIDE_M = 0.006  # per step of 0.1 s, of a stone that stays on the board
 
-# Several stones: one is done with, and the next one's turn, when it lies within these of its place ..
+# Several stones: the next one's turn comes when a stone lies within these distances of its place ..
 REACHED_LATERAL_M = (0.006, 0.009)
 REACHED_HEIGHT_M = (0.0030, 0.0050)
 # .. and the fingers are this far above its grasp, or beside it
@@ -77,7 +77,7 @@ def expert_action(state: PrivilegedState) -> np.ndarray:
 
 
 def current_goal(state: PrivilegedState) -> Goal:
-    """The goal that most of an action is for."""
+    """Return the goal with the largest share of an action."""
     return max(_shares(state), key=lambda each: each[1])[0]
 
 
@@ -87,9 +87,9 @@ def held_share(state: PrivilegedState, stone: int) -> float:
 
 
 def _shares(state: PrivilegedState) -> list[tuple[Goal, float]]:
-    """The goals that an action is for, with their shares of it: the one after the last that is reached.
+    """Return the goals that an action serves, with their shares: the goal after the last one reached.
 
-    While the fingers leave a stone that they have put down, both it and the next one have a share.
+    While the fingers leave a stone that they have put down, its goal and the next one each have a share.
     """
     shares, left = [], 1.0
     for before, goal in reversed(list(pairwise(state.goals))):
@@ -137,9 +137,9 @@ def _plan(state: PrivilegedState, tempo: float) -> tuple[np.ndarray, float]:
 
 
 def _placed(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
-    """Return how well the stone lies on the target, in [0, 1]; the wider the fingers are, the milder.
+    """Return how well the stone lies on the target, in [0, 1]; wider fingers tolerate more.
 
-    A release moves the stone a little, and must not make the expert want it back.
+    A release moves the stone a little; the expert must not grasp it again for that.
     """
     openness = _openness(state, (HELD_SHARE[0], OPEN_SHARE[0]))
     lateral_m = float(np.linalg.norm((state.goals[0].xyz - stone_xyz)[:2]))
@@ -222,7 +222,7 @@ def _grasp_z(stone_xyz: np.ndarray) -> float:
 
 
 def _step(offset_xy: np.ndarray, rise_m: float, freedom: float, tempo: float) -> np.ndarray:
-    """(3,) metres: the share of a way that one step covers. `freedom` in [0, 1] slows it sideways."""
+    """(3,) metres: the part of the way that one step covers; `freedom` in [0, 1] slows it sideways."""
     limit_m = SPEED_M_S / DEFAULT_FPS * tempo
     gain = 1 - (1 - GAIN) ** tempo
     wanted_xy = gain * offset_xy
@@ -232,7 +232,7 @@ def _step(offset_xy: np.ndarray, rise_m: float, freedom: float, tempo: float) ->
 
 
 def _ramp(value: float, low: float, high: float) -> float:
-    """0 up to `low`, 1 from `high`, a straight line between."""
+    """Ramp from 0 at `low` to 1 at `high`, constant beyond both."""
     return float(np.clip((value - low) / (high - low), 0, 1))
 
 

@@ -1,4 +1,4 @@
-"""The rules of Go that an episode needs: is a position legal, is a move legal."""
+"""The rules of Go that an episode needs: legal positions and legal moves."""
 
 from collections.abc import Mapping
 
@@ -11,7 +11,7 @@ def is_legal_position(stones: Mapping[Intersection, str]) -> bool:
 
 
 def is_legal_move(stones: Mapping[Intersection, str], intersection: Intersection, color: str) -> bool:
-    """Return True if `color` may play there: it is free, and the move captures or is no suicide."""
+    """Return True if a move is legal: its intersection is free, and it captures or is no suicide."""
     if intersection in stones:
         return False
     after = {**stones, intersection: color}
@@ -22,14 +22,14 @@ def is_legal_move(stones: Mapping[Intersection, str], intersection: Intersection
 
 
 def near(intersection: Intersection) -> list[Intersection]:
-    """The intersections beside one."""
+    """Return the intersections beside this one."""
     row, column = intersection
     intersections = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
     return [(r, c) for r, c in intersections if 0 <= r < BOARD.num_lines and 0 <= c < BOARD.num_lines]
 
 
 def group_of(stones: Mapping[Intersection, str], intersection: Intersection) -> set[Intersection]:
-    """The stones that are connected with the one on `intersection`, it among them."""
+    """Return the intersections of the group that the stone on `intersection` belongs to."""
     group, frontier = {intersection}, [intersection]
     while frontier:
         for other in near(frontier.pop()):

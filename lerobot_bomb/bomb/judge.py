@@ -29,8 +29,8 @@ class Judge:
     """State of one episode, updated with a snapshot after every control step.
 
     A stone that was carried is put down once it is no longer touched and has been at rest for `REST_S`. Then
-    it must lie flat at a place of a move that is open: on an intersection within the spec's tolerance, or
-    anywhere in the tray. Plans that have no such move are given up; the episode fails when none is left.
+    it must lie flat at a place of an open move: on an intersection within the spec's tolerance, or
+    anywhere in the tray. Plans without such a move are given up; the episode fails when none is left.
 
     Success: all moves of a plan have been made, and no stone but those of open moves was moved by more than
     10 mm from where it stood or was put down.
@@ -56,7 +56,7 @@ class Judge:
 
     @property
     def num_made(self) -> int:
-        """Moves that have been made."""
+        """Number of moves that have been made."""
         return max(len(made) for _, made in self._plans) + self._is_complete
 
     @property
@@ -75,7 +75,7 @@ class Judge:
         return BOARD.nearest_intersection(self._now.stone_xyz[self._stone, :2])
 
     def update(self, now: SceneState) -> bool:
-        """Take in the state after a control step; return True if the episode has ended."""
+        """Update with the state after a control step; return True if the episode has ended."""
         touched = now.stone_touched[:, 0] | now.stone_touched[:, 1]
         held = now.stone_touched[:, 0] & now.stone_touched[:, 1]
         step_m = now.stone_xyz - self._now.stone_xyz
@@ -104,7 +104,7 @@ class Judge:
         return bool(ended.any())
 
     def time_out(self) -> None:
-        """Say why the episode, which has not ended by itself, failed."""
+        """Set `failure` of an episode that has run out of time."""
         touched = self._now.stone_touched[self._stone]
         was_lifted = bool(self._was_lifted[self._stone])
         if self._was_lifted.any() and not was_lifted:
@@ -122,7 +122,7 @@ class Judge:
                 yield number, move
 
     def _find_movable(self) -> set[int]:
-        """Stones of open moves."""
+        """Return the stones of open moves."""
         return {
             stone
             for plan, made in self._plans
@@ -174,7 +174,7 @@ class Judge:
         return self._is_flat(stone) and bool(self._fitting(stone))
 
     def _fitting(self, stone: int) -> list[tuple[Plan, Made]]:
-        """The plans that lack, with where this stone lies, one move less."""
+        """Return the plans that have a move for this stone to where it lies, with that move made."""
         fitting = []
         for plan, made in self._plans:
             for number, move in self._open_moves(plan, made):
@@ -186,7 +186,7 @@ class Judge:
         return fitting
 
     def _judge_placement(self, stone: int) -> bool:
-        """Take in that a stone has been put down; whether the episode has ended."""
+        """Judge a stone that has been put down; return True if the episode has ended."""
         self._stone = stone
         is_place = self.nearest_intersection in self._places()
         is_near = self.placement_error_mm <= V0_TOLERANCE_MM
@@ -203,7 +203,7 @@ class Judge:
         return True
 
     def _take_move(self, stone: int) -> bool:
-        """Note that a move has been made, and return whether it was the last."""
+        """Add a move to those made; return True if it was the last."""
         fitting = self._fitting(stone)
         self._is_complete = any(len(made) == len(plan) for plan, made in fitting)
         if self._is_complete:

@@ -26,7 +26,7 @@ class Layout:
 
 
 def put_on_board(stones: Mapping[Intersection, str], layout: Layout) -> Layout:
-    """The layout with the first stones that are not in play on these intersections."""
+    """Return the layout with stones that were not in play put on these intersections."""
     stone_xy, stone_is_white = layout.stone_xy.copy(), layout.stone_is_white.copy()
     in_play = layout.stone_in_play.copy()
     for i, (intersection, color) in zip(np.flatnonzero(~in_play), stones.items(), strict=False):

@@ -13,7 +13,7 @@ type Place = Intersection | str  # an intersection, or TRAY: anywhere in it
 
 @dataclass(frozen=True)
 class Move:
-    """A stone that comes to a place."""
+    """Move of one of several stones to one of several places."""
 
     # any one of these, by index; of several, one that no move has taken before
     stones: frozenset[int]
@@ -22,7 +22,7 @@ class Move:
     is_slid: bool = False  # pushed or pulled along the board: lifting the stone is a failure
 
 
-type Plan = tuple[Move, ...]  # all of its moves are to be made, each once those it comes after are
+type Plan = tuple[Move, ...]  # all of its moves are to be made, each after those in its `after`
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def aim_at(stone: int, intersection: Intersection, is_slid: bool = False) -> Aim
 
 
 def one_move(stone: int, places: Collection[Place]) -> Move:
-    """A move of this stone to any of these places."""
+    """Return a move of this stone to any of these places."""
     return Move(frozenset([stone]), frozenset(places))
 
 

@@ -56,9 +56,9 @@ def action_bounds(control_mode: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reach_m(actions: np.ndarray, control_mode: str) -> np.ndarray:
-    """(T, ACTION_DIM) in the environment's units -> (3,) metres, where they lead.
+    """Actions (T, ACTION_DIM) in the environment's units -> (3,) metres, the point that they reach.
 
-    Relative ones from where the gripper is, absolute ones in the world's frame; limits are left aside.
+    Relative actions start at the gripper, absolute ones are in the world frame. Limits are ignored.
     """
     return actions[-1, :3] if control_mode == "absolute" else MAX_STEP_M * actions[:, :3].sum(axis=0)
 

@@ -9,8 +9,9 @@ from typing import ClassVar
 from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude, axes_of, magnitude_of, nuisances_of
 
 # Append only: an axis' place in this dict numbers its stream of random numbers.
-# Level 5 must be hard, which an expert that ignores images cannot tell. So it has floors: camera 15 degrees
-# and 20 % of the field of view, light x4 between its extremes, mass x2, latency 1 step, start 80 mm.
+# Level 5 must be hard for a policy. The expert ignores images, so it cannot tell; hence these floors:
+# camera 15 degrees and 20 % of the field of view, light x4 between its extremes, mass x2, latency 1 step,
+# start 80 mm.
 _OWN = {
     "table": Axis(
         "colour and pattern of the table, colour of the tray",

@@ -1,8 +1,8 @@
 """Pointing: which stone goes where, by the expert and by a policy.
 
-It is what a policy must read before it can act, and the stones are seen before that; what the expert would do
-for other places teaches it to act as it has pointed. A recording has all of it in columns that only training
-reads, never in an observation.
+A policy must see the stones before it can point, and point before it can act. The expert's actions for other
+places teach it to act as it has pointed. A recording has all of this in columns that only training reads,
+never in an observation.
 """
 
 from collections.abc import Mapping
@@ -20,14 +20,14 @@ from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 
 ON_INTERSECTION_M = 0.008  # a stone this near one lies on it
 TRAY_SPOT_M = 0.015  # side of a square of the tray: smaller than a stone, so that no two lie in one
-# a stone's centre, off the board from here on
+# height of its centre from which a stone is off the board
 LIFTED_M = BOARD.thickness_m + BOARD.stone_height_m / 2 + LIFT_M
 HELD = 0.5  # from this share on a stone counts as held
-NUM_OTHERS = 2  # places a frame, beside the one that is meant
+NUM_OTHERS = 2  # other places per frame, beside the expert's
 
 
 def _middles(half_m: float) -> list[float]:
-    """Return the middles of squares along a side of the tray: metres from its centre, which is one."""
+    """Return the middles of squares along a side of the tray: metres from its centre, itself a middle."""
     number = round(half_m / TRAY_SPOT_M)
     return [TRAY_SPOT_M * i for i in range(-number, number + 1)]
 
@@ -74,7 +74,7 @@ class Meant:
 
     @classmethod
     def in_state(cls, state: PrivilegedState) -> Self:
-        """Read off the true state."""
+        """Read the expert's stone and place from the true state."""
         goal = current_goal(state)
         return cls(goal.xyz[:2], state.stone_xyz[goal.stone, :2], held_share(state, goal.stone))
 
@@ -86,7 +86,7 @@ class PointedAt:
     place_xy: np.ndarray  # (2,) metres
     stone_xy: np.ndarray  # (2,) metres
     held: float | None = None  # probability that the fingers hold that stone; None: it says nothing of it
-    # of each place (x, y) of a table, the probability that it is the one; {} where there is no table
+    # place (x, y) of a table -> probability that it is the one; {} without a table
     probabilities: Mapping[tuple[float, float], float] = field(default_factory=dict)
 
     @property
@@ -105,7 +105,7 @@ class Pointing(Meant):
 
     @classmethod
     def of(cls, state: PrivilegedState, rng: np.random.Generator) -> Self:
-        """Point, and draw other places."""
+        """Read stone and place from the state, and draw other places."""
         goal = current_goal(state)
         others = [PLACES_XY_M[i] for i in rng.integers(len(PLACES_XY_M), size=NUM_OTHERS)]
         return cls(
@@ -142,7 +142,7 @@ def colors_on_spots(state: PrivilegedState) -> np.ndarray:
 
 
 def action_for(state: PrivilegedState, pointed: PointedAt) -> np.ndarray:
-    """(4,) the expert's action if stone and place were where they are pointed at; the grip stays as it is."""
+    """(4,) the expert's action if stone and place were where ``pointed`` says; the grip stays as it is."""
     goal, stone_xyz = current_goal(state), state.stone_xyz.copy()
     if held_share(state, goal.stone) < HELD:
         stone_xyz[goal.stone, :2] = pointed.stone_xy

@@ -37,13 +37,13 @@ class PrivilegedState:
     fps: int = DEFAULT_FPS
     stone_radius_m: float = BOARD.stone_radius_m
     max_opening_m: float = 0.044  # between the pads of open fingers
-    # what the gripper has been given and, for latency, has not done yet: (3,) metres, and its command or 0
+    # commands that latency holds back: motion (3,) in metres, and the gripper's command or 0
     pending_motion_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
     pending_gripper: float = 0.0
 
     @staticmethod
     def dim(num_goals: int) -> int:
-        """Length of the vector."""
+        """Length of the vector with this number of goals."""
         return sum(part.size for part in _PARTS) + num_goals * Goal.DIM
 
     def to_vector(self) -> np.ndarray:
@@ -55,7 +55,7 @@ class PrivilegedState:
         """Inverse of `to_vector`, in float64.
 
         Raises:
-            ValueError: the vector of no number of goals is as long.
+            ValueError: no number of goals gives a vector of this length.
         """
         vector = np.asarray(vector, dtype=np.float64)
         goals_size = vector.size - cls.dim(0)

@@ -59,7 +59,7 @@ class ScriptedConfig(PreTrainedConfig):
             )
 
     def refuse_training(self) -> NoReturn:
-        """Refuse: there is nothing to train."""
+        """Raise a ValueError: there is nothing to train."""
         raise ValueError(
             f"--policy.type={self.type} is scripted and has nothing to train; evaluate it with lerobot-eval"
         )

@@ -20,8 +20,8 @@ class Stream(IntEnum):
     START = 5
     SUPPLY = 6
     LEVEL = 100  # plus the axis' place in AXES: the level, where the condition gives a range
-    STATIC = 7  # how a static scene stands, beside its episode's start
-    POINTING = 8  # places beside those that are meant
+    STATIC = 7  # what a static scene draws beside its episode's start
+    POINTING = 8  # other places, beside the expert's
     AXIS = 200  # plus the axis' place in AXES: everything else that the axis draws
     ACTUATOR_NOISE = 300
 
@@ -30,10 +30,10 @@ RECORDER_NOISE = 0xDA57  # stands before the seed
 
 
 def generator(seed: int, stream: int) -> np.random.Generator:
-    """The generator of one stream of an episode's seed."""
+    """Return the generator of one stream of an episode's seed."""
     return np.random.default_rng([seed, stream])
 
 
 def recorder_noise(seed: int) -> np.random.Generator:
-    """The generator of the noise on the actions of a recorded episode."""
+    """Return the generator of the noise on the actions of a recorded episode."""
     return np.random.default_rng([RECORDER_NOISE, seed])

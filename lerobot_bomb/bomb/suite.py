@@ -24,7 +24,7 @@ class Turn:
     """Instruction that is given after a number of moves."""
 
     instruction: str
-    # what stands for the stone, the place or the command in the suite's templates and forms
+    # words for the stone, the place or the command in the suite's templates and forms
     words: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -33,14 +33,14 @@ class Episode:
     """Episode that an EpisodeSpec determines."""
 
     spec: EpisodeSpec
-    task_id: int  # which of the suite's numbered tasks it is of
+    task_id: int  # number of its task in the suite
     turns: tuple[Turn, ...]  # one, or one for each move
     opening: Mapping[Intersection, str]  # colours of the stones that stand on the board
     layout: Layout
     supply: tuple[int, ...]  # indices of the stones that lie in the tray
     plans: tuple[Plan, ...]  # any one of which fulfils the instruction
     aims: tuple[Aim, ...]  # of the expert, in its order
-    target: Intersection | None = None  # where there is one move to one intersection
+    target: Intersection | None = None  # if there is one move to one intersection
     color: str | None = None  # of the stone, where it is moved from the tray to the target
     # whether the instruction still means these plans with these stones on the board
     is_clear: Callable[[Mapping[Intersection, str]], bool] = lambda stones: True
@@ -86,10 +86,10 @@ class Episode:
 class Suite:
     """Kind of episode: how its episodes are drawn and how long they may last.
 
-    ``check`` raises a ValueError that names the flag for a spec of which no episode can be drawn.
+    ``check`` raises a ValueError that names the flag if no episode can be drawn from a spec.
     """
 
-    sample: Callable[[EpisodeSpec], Episode]  # the same spec, the same episode, without perturbations
+    sample: Callable[[EpisodeSpec], Episode]  # the same spec gives the same episode; without perturbations
     check: Callable[[EpisodeSpec], None]
     max_steps: int  # at DEFAULT_FPS; scaled with fps
     # form of the language axis -> its templates, of `Turn.words` and coordinates
@@ -98,7 +98,7 @@ class Suite:
     # a numbered task's spec
     of_task: Callable[[EpisodeSpec, int], EpisodeSpec] = lambda spec, task_id: replace(spec, task_id=task_id)
     num_goals: int = 1  # of the expert, at most
-    # of task, physics, observation and success rule: recordings and results of different ones do not compare
+    # of task, physics, observation and success rule; recordings and results of two versions do not compare
     version: str = FIRST_VERSION
 
 
@@ -108,12 +108,12 @@ def find_suite(name: str) -> Suite:
 
 
 def task_version(name: str) -> str:
-    """The version of a suite; of `all`, the newest of them."""
+    """Return the version of a suite; for `all`, the newest of its suites."""
     return max(find_suite(each).version for each in suites_of(name))
 
 
 def suites_of(name: str) -> tuple[str, ...]:
-    """The suites that a flag's value names: one, or `all`."""
+    """Return the suites that a flag's value names: one, or `all`."""
     return OWN_SUITES if name == ALL else (name,)
 
 
@@ -144,7 +144,7 @@ def specs_of_tasks(spec: EpisodeSpec, task_ids: Sequence[int]) -> list[EpisodeSp
     """Return the spec for each of these numbered tasks of its suite; without numbers, the spec itself.
 
     Raises:
-        ValueError: the suite has no such task, one is there twice, or the spec fixes what a task fixes.
+        ValueError: the suite lacks a task, a task is given twice, or the spec fixes what a task fixes.
     """
     suite = find_suite(spec.suite)
     if len(set(task_ids)) < len(task_ids):

@@ -50,5 +50,5 @@ def acting_policy() -> PreTrainedPolicy | None:
 
 
 def name_of(config: PreTrainedConfig) -> str:
-    """'the checkpoint outputs/act', 'this act'."""
+    """Name a config's policy: 'the checkpoint outputs/act', 'this act'."""
     return f"the checkpoint {config.pretrained_path}" if config.pretrained_path else f"this {config.type}"

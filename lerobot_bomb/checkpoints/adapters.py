@@ -30,9 +30,9 @@ PROJECTIONS = "q|k|v|o|gate|up|down"  # of a layer's attention and MLP
 def peft_targets(
     policy: nn.Module, text_model: str, new_parts: Iterable[str], others: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Adapters on every projection of the text model's layers; new parts are trained whole.
+    """Settings of `peft`: adapters on all projections of the text model's layers; new parts train whole.
 
-    ``others``: patterns of more modules with adapters. Of ``new_parts``, those that the policy has.
+    ``others``: patterns of more modules with adapters. ``new_parts`` that the policy lacks are left out.
     """
     text = rf"backbone\.vlm\.model\.{text_model}\.layers\..*\.({PROJECTIONS})_proj"
     return {
@@ -42,7 +42,7 @@ def peft_targets(
 
 
 def frozen_buffers(policy: nn.Module) -> dict[str, Tensor]:
-    """Copies of all that a policy's state holds besides parameters."""
+    """Return copies of everything in a policy's state but its parameters."""
     parameters = dict(policy.named_parameters(remove_duplicate=False))
     return {name: held.clone() for name, held in policy.state_dict().items() if name not in parameters}
 
@@ -50,10 +50,10 @@ def frozen_buffers(policy: nn.Module) -> dict[str, Tensor]:
 def check_buffers_are_the_bases(
     policy: nn.Module, base: dict[str, Tensor] | None, saved: Iterable[str], advice: str
 ) -> None:
-    """Raise a ValueError if the policy was fitted to other data than the checkpoint ``base``.
+    """Raise a ValueError if the policy's buffers differ from those of the checkpoint ``base``.
 
-    Adapters are loaded on that checkpoint again, which does not have these values. They hold the modules that
-    are ``saved`` with them.
+    Adapters will be loaded on that checkpoint, which lacks values fitted to other data. Only the modules
+    ``saved`` come with the adapters.
     """
     of_saved = tuple(f"{name}." for name in saved)
     fitted = {name: held for name, held in frozen_buffers(policy).items() if not name.startswith(of_saved)}
@@ -72,9 +72,9 @@ def check_base(base: str) -> None:
 
 
 def check_adapters(path: str, revision: str | None) -> Path:
-    """Return the file of adapters, from a folder or the Hub, checked: whole, finite, all that `peft` reads.
+    """Check the adapters in a folder or on the Hub, with all that `peft` would read; return their file.
 
-    They are safetensors; in their place `peft` would read a pickle.
+    It must be safetensors; without it `peft` would read a pickle.
 
     Raises:
         FileNotFoundError: there are none.
@@ -93,7 +93,7 @@ def check_adapters(path: str, revision: str | None) -> Path:
 
 
 def _file(path: str, name: str, revision: str | None) -> Path:
-    """One of a folder or of a repository, which is downloaded if need be."""
+    """Return a file of a folder, or of a Hub repository; there it is downloaded if need be."""
     if not Path(path).is_dir():
         try:
             return Path(hf_hub_download(path, name, revision=revision))
@@ -115,10 +115,10 @@ def _named(values: Any) -> set[str]:
 
 
 def check_adapters_fit(policy_type: Any, config: Any, path: str, revision: str | None) -> None:
-    """Check that adapters are all that their config puts on a policy; `peft` would only warn.
+    """Check that adapters fit a policy and none is missing; `peft` would only warn.
 
     Raises:
-        ValueError: they are another policy's, or only a part of them is there.
+        ValueError: they are another policy's, or a part is missing; or `peft` is not installed.
     """
     try:
         import peft  # pyright: ignore[reportMissingImports]

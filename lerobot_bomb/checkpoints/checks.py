@@ -28,7 +28,7 @@ from lerobot_bomb.finite import is_finite, require_finite
 ADAPTERS = ("adapter_config.json", "adapter_model.safetensors")
 PROCESSORS = (f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json")
 
-# of a grid: rows of fewer bins than the finest coordinate's end with inf
+# a grid's edges: rows of fewer bins than the finest coordinate's end with inf
 FILLED_WITH_INF = "grids.edges"
 
 type Shapes = dict[str, tuple[int, ...]]
@@ -56,11 +56,11 @@ def checkpoint_files(folder: Path) -> list[str]:
 
 
 def processor_files(folder: Path, processor: str) -> list[str]:
-    """Names of the files that make up one of `PROCESSORS`, each whole and data only; none is loaded.
+    """Return the names of a processor's files, each whole and data only; none is loaded.
 
     Raises:
-        ValueError: one is missing, truncated, not finite, of no floats or of another format, or a step is not
-            registered.
+        ValueError: one is missing, truncated, not finite, not of floats or of another format, or a step is
+            not registered.
     """
     register_third_party_plugins()  # their steps
     content = read_json(folder / processor)
@@ -88,11 +88,11 @@ def tensor_shapes(path: Path) -> Shapes:
 
 
 def check_finite(path: Path) -> None:
-    """Raise if a tensor of a safetensors file holds NaN or infinite values; one at a time is in memory.
+    """Check that a safetensors file holds no NaN or infinite values; one tensor at a time is in memory.
 
     Raises:
-        ValueError: names the file, the first such tensor, how many of its values are and where; or the file
-            is truncated or of another format.
+        ValueError: a tensor is not finite; the message names it, how many of its values are not, and where.
+            Or the file is truncated or of another format.
     """
     advice = "; take a checkpoint from before, or train again"
     try:
@@ -107,14 +107,14 @@ def check_finite(path: Path) -> None:
 
 
 def _without_filling(edges: Tensor) -> Tensor:
-    """(C, E) -> the same with 0 in place of the inf that ends a row, after at least two edges."""
+    """Edges (C, E) -> the same with 0 in place of each row's trailing inf, but for its first two edges."""
     is_filling = (edges == torch.inf).flip(1).cumprod(dim=1).flip(1).bool()
     is_filling[:, :2] = False
     return edges.masked_fill(is_filling, 0)
 
 
 def policy_class(folder: Path) -> type[PreTrainedPolicy]:
-    """The class of a checkpoint's type, which has a card of its own.
+    """Return the policy class of a checkpoint of one of our types.
 
     Raises:
         ValueError: the type is not one of ours.
@@ -134,7 +134,7 @@ def check_config(folder: Path, config: PreTrainedConfig) -> None:
     """Check that a checkpoint needs nothing but its own files, and no code.
 
     Raises:
-        ValueError: names what it needs.
+        ValueError: it needs more; the message names what.
     """
     for field, value in vars(config).items():
         if field.endswith("_config") and _names_code(value):
@@ -167,13 +167,13 @@ def check_weights(folder: Path, config: PreTrainedConfig, policy_type: type[PreT
 
 
 def check_tensors(path: Path, policy: PreTrainedPolicy) -> list[str]:
-    """Check that a file's weights fit a policy, by name and shape; return the names of those it needs.
+    """Check that a file's weights fit a policy, by name and shape; return the names of those that it needs.
 
     A policy may do without parts of a file (``may_skip``) and have parts of its own that the file lacks as a
     whole (``may_lack``): names of modules.
 
     Raises:
-        ValueError: it is truncated, or names the first tensor that is missing, unknown or of another shape.
+        ValueError: the file is truncated; or names a tensor that is missing, unknown or of another shape.
     """
     may_skip, may_lack = getattr(policy, "may_skip", ()), getattr(policy, "may_lack", ())
     saved = {name: shape for name, shape in tensor_shapes(path).items() if not _is_of(name, may_skip)}
@@ -205,7 +205,7 @@ def _is_of(name: str, modules: Iterable[str]) -> bool:
 
 
 def _tied(policy: PreTrainedPolicy, saved: set[str]) -> set[str]:
-    """Tensors that are the same as a saved one, under another name."""
+    """Return the names of tensors that are tied to a saved one."""
     found = set()
     for prefix, module in policy.named_modules():
         for pair in (getattr(module, "all_tied_weights_keys", None) or {}).items():

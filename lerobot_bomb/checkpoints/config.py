@@ -16,9 +16,9 @@ MAX_SHOWN = 60  # characters
 
 
 class PackageVersion(str):
-    """A config's field of this type is the installed version; reading one of a newer release is an error.
+    """Version in a config: reading gives the installed version, or an error if the config is newer.
 
-    Releases that differ in the third number only read each other's checkpoints.
+    Releases that differ only in the third number read each other's checkpoints.
     """
 
 
@@ -27,10 +27,10 @@ INSTALLED = PackageVersion(__version__)
 
 @draccus.decode.register(PackageVersion)
 def _decode(written_by: str, path: Sequence[str]) -> PackageVersion:
-    """Return the installed version, which writes the config the next time.
+    """Return the installed version, with which the config would be written next.
 
     Raises:
-        DecodingError: the checkpoint is newer; its fields and weights may mean what nobody here knows.
+        DecodingError: the checkpoint is newer, so its fields and weights may mean something else.
     """
     use()
     if Version(written_by).release[:2] > Version(__version__).release[:2]:
@@ -46,7 +46,7 @@ draccus.encode.register(PackageVersion, str)
 
 
 def config_damage(pretrained: str | Path, revision: str | None) -> str | None:
-    """Say why a config.json is no policy's; None if it is one, or if there is no file."""
+    """Return why a config.json is not a policy's; None if it is, or if there is no file."""
     try:
         file = local_file(pretrained, revision, CONFIG)
         policy_type = None if file is None else read_json(file).get("type")

@@ -64,7 +64,7 @@ class EvaluatedEnv(_EnvConfig):
         """Import the simulator; return the class of environments, which takes `gym_kwargs` and a spec."""
 
     def _on_first_reset(self) -> Callable[[Any], Callable[[Any], None] | None]:
-        """Return what gives for a spec the function that its first observations are shown to, if any."""
+        """Return a function that maps a spec to the one to call with its first observations, or to None."""
         return lambda spec: None
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
@@ -81,7 +81,7 @@ class EvaluatedEnv(_EnvConfig):
 
         Raises:
             NoOpenGLError: MuJoCo cannot render on this machine.
-            ValueError: the simulator is not there, or --env.results_path cannot be written.
+            ValueError: the simulator is not installed, or --env.results_path cannot be written.
         """
         make_env, on_first_reset = self._import_env(), self._on_first_reset()
         check_results_path(self.results_path)

@@ -1,4 +1,4 @@
-"""Environment that a policy was trained for, and the check that it is the one to act in."""
+"""The environment that a policy was trained for, and the check that the policy acts in no other."""
 
 import logging
 from collections.abc import Iterable
@@ -78,7 +78,7 @@ def environment_of_dataset(root: Path | str | None) -> Environment | None:
 
 
 def dataset_of_training(config: PreTrainedConfig) -> Path | None:
-    """Folder of the dataset that it is being trained on, or that its checkpoint's training names.
+    """Return the folder of the dataset that a policy is being trained on, or was trained on.
 
     It may be gone. None if unknown.
     """
@@ -109,10 +109,10 @@ def _check(config: PreTrainedConfig, who: str, here: Environment) -> None:
 
 
 def complete_evaluation(config: Any) -> None:
-    """Fill in what the flags of LeRobot's EvalPipelineConfig leave open and its policy's checkpoint knows.
+    """Fill in the values of LeRobot's EvalPipelineConfig that its policy's checkpoint knows.
 
     Raises:
-        FlagError: it is to record several episodes.
+        FlagError: the evaluation would record several episodes.
     """
     refuse_recording_of_several(config)
     if hasattr(config.env, "take_image_size"):

@@ -1,4 +1,4 @@
-"""A checkpoint's folder, read as LeRobot's commands read it, and written."""
+"""Read a checkpoint's folder as LeRobot's commands do, and write one."""
 
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -53,10 +53,10 @@ def parse_config(path: Path, device: str | None, flags: Sequence[str] = ()) -> P
 
 
 def load_processors(config: PreTrainedConfig) -> tuple[Preprocessor, Postprocessor]:
-    """The processors saved with a checkpoint, on the config's device.
+    """Load the processors of a checkpoint, on the config's device.
 
     Raises:
-        ValueError: they are not whole, or not data only (`lerobot_bomb.checkpoints.processor_files`).
+        ValueError: they are incomplete, or not data only (`lerobot_bomb.checkpoints.processor_files`).
     """
     folder = Path(str(config.pretrained_path))
     for name in PROCESSORS:
@@ -74,7 +74,7 @@ def load_processors(config: PreTrainedConfig) -> tuple[Preprocessor, Postprocess
 def write_checkpoint(
     path: Path, policy: PreTrainedPolicy, processors: Iterable[PolicyProcessorPipeline[Any, Any]]
 ) -> None:
-    """Write config, weights and processors to a new folder, which appears complete."""
+    """Write config, weights and processors to a new folder, which appears when complete."""
     with written_whole(path) as (folder,):
         policy.save_pretrained(folder)
         for processor in processors:
@@ -82,5 +82,5 @@ def write_checkpoint(
 
 
 def autocast(config: PreTrainedConfig) -> AbstractContextManager:
-    """The precision in which LeRobot's commands call the policy."""
+    """Return the context for the precision in which LeRobot's commands call the policy."""
     return torch.autocast(get_safe_torch_device(str(config.device)).type) if config.use_amp else nullcontext()

@@ -20,7 +20,7 @@ from lerobot_bomb.files import read_json
 from lerobot_bomb.results.origin import PolicyIdentity
 
 PROCESSOR_PATTERNS = ("policy_preprocessor*", "policy_postprocessor*")
-# in a config, but not of what the policy does
+# fields of a config that do not change what the policy does
 NOT_ITS_SETTINGS = {
     "device", "pretrained_path", "pretrained_revision", "package_version", "use_peft", "ignore_environment",
     "push_to_hub", "repo_id", "private", "tags", "license",
@@ -28,7 +28,7 @@ NOT_ITS_SETTINGS = {
 
 
 def identity_of(policy: PreTrainedPolicy) -> PolicyIdentity:
-    """Return the identity of a policy."""
+    """Return the identity of a policy; while it is being trained, only its type."""
     if training_data(policy.config) is not None:
         return PolicyIdentity(policy.config.type, is_in_training=True)
     return identity_of_config(policy.config)
@@ -40,9 +40,9 @@ def identity_of_config(config: PreTrainedConfig) -> PolicyIdentity:
 
 
 def policy_of_results(results_path: str | None, num_envs: int) -> list[dict[str, PolicyIdentity]]:
-    """Argument of each environment that writes records of results: the policy, which LeRobot builds later.
+    """Return for each environment the argument that names the policy in its records; {} if there is none.
 
-    From now on its queries are timed.
+    LeRobot builds the policy after the environments. From now on its queries are timed.
     """
     policy = None if results_path is None else acting_policy()
     if policy is None:

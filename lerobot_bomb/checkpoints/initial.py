@@ -45,7 +45,7 @@ def write_initial(flags: Sequence[str], repo_id: str, root: Path | None, output:
 
 
 def parse_policy(flags: Sequence[str]) -> PreTrainedConfig:
-    """The config that --policy.* flags describe."""
+    """Parse the config that --policy.* flags describe."""
     others = [flag for flag in flags if flag.startswith("--") and not flag.startswith(PREFIX)]
     if others:
         raise ValueError(f"unrecognized arguments: {' '.join(others)}")

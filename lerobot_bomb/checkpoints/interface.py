@@ -14,7 +14,7 @@ from lerobot_bomb.checkpoints.environment import trained_environment
 from lerobot_bomb.checkpoints.identity import weights_file
 from lerobot_bomb.compat.hooks.policies import training_data
 
-# of where actions may lie; what moves over less of it in all demonstrations is in another unit
+# share of the range of actions; demonstrations that span less of it are in another unit
 LEAST_SPAN = 0.01
 UNNORMALIZER = f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}_step_*_unnormalizer_processor.safetensors"
 
@@ -30,7 +30,7 @@ class Interface:
     image_flags: Callable[[int, int], str]  # (height, width) -> the flags of images of this size
 
     def check_acting_policy(self) -> None:
-        """Check, as far as is known, that the acting policy was trained for such an environment.
+        """Check, as far as is known, that the acting policy was trained for this kind of environment.
 
         Raises:
             ValueError: it was trained for another one; the message says what differs and the way out.

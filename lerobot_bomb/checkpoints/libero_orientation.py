@@ -19,7 +19,7 @@ MAX_EPISODES, MAX_IMAGES = 3, 12  # of a dataset, that are read
 
 
 class OrientationCheck:
-    """Says once in an evaluation that the policy's images were turned, where their dataset is still here.
+    """Warns once per evaluation if the training's images were turned; their dataset must be on this machine.
 
     Args:
         key: feature of the dataset that holds the images.
@@ -30,7 +30,7 @@ class OrientationCheck:
         self._is_done = False
 
     def compare(self, shown: np.ndarray, task: str) -> None:
-        """Compare with images of the environment, (N, H, W, 3) uint8, in episodes of a task of the suite."""
+        """Compare images of the environment, (N, H, W, 3) uint8, with those of a task in the training."""
         config = None if self._is_done else acting_config()
         if config is None:
             return

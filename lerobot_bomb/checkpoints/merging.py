@@ -11,7 +11,7 @@ from lerobot_bomb.checkpoints.folder import load_processors, read_config, write_
 
 
 def merge(adapters: Path, output: Path) -> None:
-    """Write a whole checkpoint to a new folder.
+    """Merge adapters into their base, and write the checkpoint to a new folder.
 
     Raises:
         ValueError: there are no adapters in the folder, or their base cannot be loaded.

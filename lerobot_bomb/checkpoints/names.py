@@ -1,4 +1,4 @@
-"""Names: of files of a checkpoint, on the Hub, and paths that nobody else has."""
+"""Names of a checkpoint's files, ids on the Hub, and paths that only this machine has."""
 
 import re
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 CONFIG, TRAIN_CONFIG, WEIGHTS = "config.json", "train_config.json", "model.safetensors"
 PREPROCESSOR = "policy_preprocessor.json"
 
-# of the steps that change on purpose what a policy is shown
+# processor steps that change a policy's inputs on purpose
 BLANK_IMAGES, REPLACE_TASKS = "bomb_blank_images", "bomb_replace_tasks"
 
 # what to do with adapters whose base is on one machine only
@@ -38,7 +38,7 @@ def is_hub_id(name: object) -> bool:
 
 
 def local_file(checkpoint: Path | str, revision: str | None, name: str) -> Path | None:
-    """Return a file of a folder, or of a repository on the Hub as it was downloaded; None if it has none."""
+    """Return a file of a folder, or of a downloaded repository of the Hub; None if there is none."""
     if Path(checkpoint).is_dir():
         path = Path(checkpoint) / name
         return path if path.is_file() else None

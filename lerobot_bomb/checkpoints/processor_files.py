@@ -1,6 +1,6 @@
 """Checks that a checkpoint's processors are data: they name known steps, which have all they need.
 
-LeRobot imports and calls whatever `class` a step names, before it looks at what came out.
+LeRobot imports and calls whatever `class` a step names, before it checks the result.
 """
 
 import os
@@ -37,7 +37,7 @@ RUN_CODE = {
     "robometer_encoder": ("robometer",),
     "topreward_encoder": ("topreward",),
 }
-# the only one that LeRobot saves by its class and has not loaded before
+# the only step that LeRobot saves by its class and has not loaded before
 SARM_STEP = "lerobot.rewards.sarm.processor_sarm.SARMEncodingProcessorStep"
 # steps of LeRobot that read files of the repository or folder that their config names
 READ_OTHERS = {"tokenizer_processor", "eo1_qwen_processor", "molmoact2_pack_inputs"}
@@ -48,7 +48,7 @@ NEEDED = {
 }
 # steps that hold statistics
 NORMALIZERS = {step for steps in NEEDED.values() for step in steps}
-# of which values are normalised; none by the identity
+# statistics that a mode normalises by; the identity has none
 STATISTICS = {**BOUND_STATISTICS, NormalizationMode.MEAN_STD: CENTRE_AND_DISTANCE}
 
 
@@ -61,15 +61,15 @@ def saved_type(config_file: Path) -> object:
 
 
 def _is_our_type(policy_type: object) -> bool:
-    """Return True if checkpoints of this type, as config.json names it, hold all that they need."""
+    """Return True if a type, as config.json names it, is ours: its checkpoints hold all that they need."""
     known = PreTrainedConfig.get_known_choices()
     return isinstance(policy_type, str) and hasattr(known.get(policy_type), "package_version")
 
 
 def state_files(content: Mapping[str, Any], where: str, policy_type: object) -> list[str]:
-    """Names of the state files of a processor's JSON, which is checked; no step is built.
+    """Check a processor's JSON, and return the names of its state files; no step is built.
 
-    All plugins are registered. `where` is the file, for errors; `policy_type` is the checkpoint's.
+    Plugins must be registered before. `where` is the file, for errors; `policy_type` is the checkpoint's.
 
     Raises:
         ValueError: a step is not registered, would run code, or its state lies elsewhere.
@@ -118,10 +118,10 @@ def _check_step(step: Mapping[str, Any], where: str, policy_type: object) -> Non
 
 
 def _name_of_class(path: object, where: str, policy_type: object) -> str | None:
-    """Return the registered name, if any, of a step given by its class path; its module is loaded.
+    """Return the registered name, if any, of a step given by the path of a class in a loaded module.
 
     Raises:
-        ValueError: it is no such step, or the checkpoint is of our types, whose steps are all registered.
+        ValueError: it is no step, or the checkpoint is of our types, whose steps are all registered.
     """
     if isinstance(path, str) and not _is_our_type(policy_type):
         module, _, name = path.rpartition(".")
@@ -163,7 +163,7 @@ def _check_artifacts(artifacts: object, what: str, policy_type: object) -> None:
 
 
 def check_saved_processors() -> None:
-    """Check every processor that is loaded in this process, by LeRobot's commands too."""
+    """Check, from now on, every processor that this process loads, also in LeRobot's commands."""
 
     def check(content: dict[str, Any], where: str, config: Path) -> None:
         for name in state_files(content, where, saved_type(config)):
@@ -188,7 +188,7 @@ def check_float_statistics(content: Mapping[str, Any], folder: Path) -> None:
     """Check that a processor's saved statistics are floats; loading would hide that they were rounded.
 
     Raises:
-        ValueError: names the file and the first that are none.
+        ValueError: names the file and the first statistic that is not a float.
     """
     for step in content["steps"]:
         path = folder / step.get("state_file", "")
@@ -205,7 +205,7 @@ def check_float_statistics(content: Mapping[str, Any], folder: Path) -> None:
 
 
 def check_states(steps: Sequence[Any], where: str, complete: bool) -> None:
-    """Check that the steps' loaded states are finite where used; `complete`: and hold all that is used.
+    """Check that the steps' loaded states are finite where used and, if `complete`, hold all that is used.
 
     Raises:
         ValueError: names the statistic that is missing, of another shape or not finite.

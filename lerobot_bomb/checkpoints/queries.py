@@ -1,4 +1,4 @@
-"""Time that the policy of this process takes to answer, whatever its type."""
+"""Timing of the queries of this process' policy, whatever its type."""
 
 from collections import deque
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from lerobot_bomb.compat.hooks.policies import wrap_select_action
 from lerobot_bomb.results.inference import Query
 
 PROCESS = Path("/proc/self")  # of Linux
-RESET_PEAK = "5"  # that a process' peak memory is counted anew
+RESET_PEAK = "5"  # in clear_refs: count a process' peak memory anew
 
 _CLOCKS: "WeakKeyDictionary[PreTrainedPolicy, _Clock]" = WeakKeyDictionary()
 
@@ -30,7 +30,7 @@ def time_queries(policy: PreTrainedPolicy) -> None:
 
 
 def last_query() -> Query | None:
-    """The last call of a timed policy's `select_action`, if it ran the network; None the next time."""
+    """Return the last call of a timed policy's `select_action`, once and only if it ran the network."""
     for clock in list(_CLOCKS.values()):
         query, clock.query = clock.query, None
         if query is not None:
@@ -103,13 +103,13 @@ def _queue_lengths(policy: PreTrainedPolicy) -> dict[tuple[str, ...], int]:
 
 
 def _told(policy: PreTrainedPolicy, name: str) -> Any:
-    """Return a number that a policy tells of its last query; None if it tells none of this name."""
+    """Return a number that a policy keeps of its last query; None if it has none of this name."""
     value = getattr(policy, name, None)
     return value if type(value) in (int, float) else None
 
 
 def _device_name(device: torch.device) -> str:
-    """'NVIDIA H100', 'cpu, 1 thread': the record names the processor."""
+    """Name a device: 'NVIDIA H100', 'cpu, 1 thread'; the record also names the processor."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     if device.type == "cpu":

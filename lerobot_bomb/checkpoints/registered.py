@@ -12,7 +12,7 @@ KINDS = {"policies": ("PreTrainedConfig", "*/configuration_*.py"), "envs": ("Env
 
 
 def registered_types(kind: str) -> set[str] | None:
-    """Return the types of LeRobot and its plugins, of one of `KINDS`; None if source does not tell all."""
+    """Return the types of one of `KINDS` in LeRobot and its plugins; None if source does not show all."""
     registry, pattern = KINDS[kind]
     spec = find_spec("lerobot")
     plugins = {

@@ -41,7 +41,7 @@ RENAMED = {
     CELLS: "cell_embedding.weight",
 }
 TRANSLATION, ROTATION = ("theta_bins", "phi_bins", "r_bins"), ("roll_bins", "pitch_bins", "yaw_bins")
-# of the folder's files; the rest has defaults
+# keys that the folder's files must have; the rest has defaults
 ORIGINAL_KEYS = (
     *("action_token_begin_idx", "image_token_index", "projection_dim", "hidden_size", "spatial_token_num"),
     *("text_config", "vision_config", "use_vision_zoe", "ego3d_patch_reso", "n_freqs"),
@@ -49,7 +49,7 @@ ORIGINAL_KEYS = (
 PROCESSOR_KEYS = ("statistics", "action_config", "action_chunk_size", "intrinsic_config")
 BARE_TASK = "{}"
 GRIPPER = 6  # of the action's dims
-# least sigma of the published grid, which no file of its folder says
+# least sigma of the published grid, which no file of its folder states
 PUBLISHED_MIN_SIGMA = 0.5
 EDGE_TOLERANCE = 1e-6
 
@@ -71,7 +71,7 @@ def convert(published: Published, output: Path) -> str:
     """Write the checkpoint to a new folder; return a sentence on its prompt.
 
     Raises:
-        ValueError: the folder is not whole, or other than its options say.
+        ValueError: the folder is incomplete, or does not match its options.
     """
     original = read_json(published.folder / "config.json")
     if original.get("model_type") != "spatialvla":
@@ -130,9 +130,9 @@ def _chosen_statistics(statistics: dict[str, Any], name: str | None) -> str:
 
 
 def _action_scales(action: dict[str, Any]) -> dict[str, Tensor]:
-    """Return the actions that -1 and 1 stand for, where the original scales by q01 and q99.
+    """Return the actions (D,) that -1 and 1 stand for, as LeRobot's statistics q01 and q99.
 
-    It does so where ``mask`` says so. Its gripper is 0 or 1 before, where ours is -1 or 1.
+    The original scales only the dims in ``mask``. Its gripper is 0 or 1 before scaling, ours -1 or 1.
     """
     low, high = (torch.tensor(action[key], dtype=torch.float32) for key in ("q01", "q99"))
     scaled = torch.tensor(action.get("mask", [True] * len(low)))
@@ -142,7 +142,7 @@ def _action_scales(action: dict[str, Any]) -> dict[str, Tensor]:
 
 
 def _grids(published: Published, processor: dict[str, Any]) -> ActionGrids:
-    """Build grids from the folder's own edges and the Gaussians of --grid, which those must be made of."""
+    """Build grids from the folder's own edges and the Gaussians of --grid, which must give the same edges."""
     counts, policy = processor["action_config"]["num_bins"], processor.get("bin_policy")
     if policy is None:
         raise ValueError(
@@ -241,7 +241,7 @@ def _config(
 def _intrinsics(
     cameras: dict[str, Any], statistics: str, camera: str, side: int
 ) -> dict[str, list[list[float]]]:
-    """Return the camera's intrinsics from the folder, for images of ``side``; {}: the default ones."""
+    """Return the camera's intrinsics from the folder, for images of ``side``; {} for the default ones."""
     calibration = cameras.get(statistics) or cameras["default"]
     # the original counts from the image's edge, the flag from the first pixel's centre
     K = torch.tensor([calibration["intrinsic"]], dtype=torch.float32)
@@ -253,7 +253,7 @@ def _intrinsics(
 
 
 def _weights(folder: Path, original: dict[str, Any], ours: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The folder's tensors under our names, float32; of Ego3D, where the folder has none, ours.
+    """Return the folder's tensors under our names, in float32; Ego3D's are ours if the folder has none.
 
     Raises:
         ValueError: there are none, or one is missing or not finite.
@@ -274,7 +274,7 @@ def _weights(folder: Path, original: dict[str, Any], ours: dict[str, Tensor]) ->
 
 
 def _renamed(tensors: dict[str, Tensor]) -> Iterator[tuple[str, Tensor]]:
-    """Yield the policy's tensors under its names; of an unknown one, strict loading tells the name."""
+    """Yield tensors under the policy's names; an unknown one keeps its name, which strict loading reports."""
     for name, tensor in tensors.items():
         if not name.startswith(POOLING_HEAD):
             begins = next((begins for begins in RENAMED if name.startswith(begins)), "")

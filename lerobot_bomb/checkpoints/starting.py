@@ -26,10 +26,10 @@ def way_to_start_otherwise(checkpoint: str | Path, policy_type: str) -> str:
 
 
 def check_start(checkpoint: str | Path, config: Any, meta: "LeRobotDatasetMetadata | None") -> None:
-    """Raise a ValueError unless a config is a checkpoint's own, and data or environment have its actions.
+    """Raise a ValueError unless a config can start from a checkpoint on its data or in its environment.
 
-    Of what the weights do not depend on (sizes of images, numbers that are written as text) the config takes
-    the data's shapes.
+    Where weights do not depend on shapes (sizes of images, numbers written as text), the config takes the
+    data's.
     """
     if not _has_config(checkpoint):
         return
@@ -55,7 +55,7 @@ def _lacks_architecture(config: Any) -> bool:
 
 
 def _fit_environment(checkpoint: str | Path, config: Any, saved: Any) -> None:
-    """Raise a ValueError if the environment whose actions LeRobot put into a config has others."""
+    """Raise a ValueError if a config's actions, which are the environment's, are not the checkpoint's."""
     there, here = ((each.output_features or {}).get(ACTION) for each in (saved, config))
     if there and here and tuple(there.shape) != tuple(here.shape):
         trained = f"; it was trained for {saved.environment}" if saved.environment else ""

@@ -1,4 +1,4 @@
-"""Training of a checkpoint, as its files tell it."""
+"""Training of a checkpoint, as its files describe it."""
 
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ def read_train_config(checkpoint: Path) -> dict[str, Any]:
 
 
 def dataset_of(train_config: dict[str, Any]) -> Path | None:
-    """Folder of the dataset, which may be gone; None if unknown.
+    """Return the folder of the training's dataset, which may be gone; None if unknown.
 
     Raises:
         ValueError: the config names no dataset as lerobot-train does.

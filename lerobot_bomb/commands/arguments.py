@@ -23,7 +23,7 @@ LONG_FORMS = {
         "ignore_checkpoint",
     )
 }
-ANSWER_IS_NO = 3  # exit code of a command that was asked something; 1 is an error, 2 a flag that is unknown
+ANSWER_IS_NO = 3  # exit code of a command that answers a question with no; 1 is an error, 2 an unknown flag
 
 
 def path_flag(text: str) -> Path:
@@ -82,7 +82,7 @@ def add_episode_files_argument(parser: argparse.ArgumentParser, folder: Path) ->
 
 
 def check_at_least(args: argparse.Namespace, **lowest: int) -> None:
-    """Raise a ValueError if a flag of this name is smaller."""
+    """Raise a ValueError if a flag is below its lowest value: `episodes=1`."""
     for name, bound in lowest.items():
         if getattr(args, name) < bound:
             raise ValueError(f"--{name}={getattr(args, name)} must be at least {bound}")

@@ -101,7 +101,7 @@ def _second_groups(args: argparse.Namespace, evaluated: list[Record]) -> dict[st
 
 
 def _changed(args: argparse.Namespace, name: str, step: "ProcessorStep") -> str:
-    """The flag of the checkpoint with an intervention, which is written unless it is there."""
+    """Return --policy.path of the checkpoint with an intervention; write that checkpoint unless it exists."""
     from lerobot_bomb.explain.interventions import intervene
 
     folder = args.folder / name
@@ -127,7 +127,7 @@ def _job(args: argparse.Namespace, policy: str, split: str = "", batch_size: int
 
 
 def _run_jobs(args: argparse.Namespace, folder: Path, jobs: dict[str, Job]) -> dict[str, list[Record]]:
-    """Return {group: its records}.
+    """Run the jobs; return {group: its records}.
 
     Raises:
         ValueError: the folder is of another audit.

@@ -1,4 +1,4 @@
-"""``lerobot-bomb checkpoint export-backbone``: its vision-language model as a folder, a base for others.
+"""``lerobot-bomb checkpoint export-backbone``: a vision-language model as a folder, a base for others.
 
 A policy of any type that reads the same family of models can start from it:
 ``--policy.vlm_model_name=FOLDER``.

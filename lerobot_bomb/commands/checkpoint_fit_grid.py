@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def json_of(kind: type) -> Callable[[str], Any]:
-    """A reader of flags that are JSON of this type."""
+    """Return argparse's reader of a flag that is JSON of this type."""
 
     def read(text: str) -> Any:
         value = json.loads(text)

@@ -10,7 +10,7 @@ from lerobot_bomb.files import check_new_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare dataset, folder and seed; the policy's flags are LeRobot's parser's."""
+    """Declare dataset, folder and seed; LeRobot's parser reads the policy's flags."""
     parser.set_defaults(rest=[])
     flags = "--policy.type=TYPE --dataset.repo_id=ID --output=DIR (all flags --policy.*)"
     parser.usage = f"{parser.prog} {flags}"

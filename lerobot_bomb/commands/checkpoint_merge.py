@@ -1,4 +1,4 @@
-"""``lerobot-bomb checkpoint merge``: adapters and their base as one checkpoint, without either or `peft`."""
+"""``lerobot-bomb checkpoint merge``: adapters and their base as one checkpoint that loads without `peft`."""
 
 import argparse
 

@@ -14,12 +14,12 @@ from lerobot_bomb.sweep.manifest import parse_part
 if TYPE_CHECKING:
     from submitit import Job
 
-SUBMITIT = "submitit"  # the folder of what its jobs print
+SUBMITIT = "submitit"  # folder of its jobs' output
 SUBMITIT_FLAGS = (SUBMITIT, "submitit_cluster", "submitit_parameters")
 
 
 def add_job_arguments(parser: argparse.ArgumentParser, parts_of: str, script: str) -> Any:
-    """Declare who does which part; return the group of flags that exclude one another."""
+    """Declare the flags of parts and of jobs; return the group of flags that exclude one another."""
     where = parser.add_mutually_exclusive_group()
     add = where.add_argument
     add("--shard", metavar="I/N", help=f"do part I of N of the {parts_of} only: 0/4 is the first of four")
@@ -43,10 +43,10 @@ def _json_object(text: str) -> dict[str, Any]:
 
 
 def shard_of(args: argparse.Namespace) -> tuple[int, int] | None:
-    """(0, 4) of --shard=0/4, None without it.
+    """Return (0, 4) for --shard=0/4; None without the flag.
 
     Raises:
-        ValueError: it is no part, or a flag of submitit's stands without --submitit.
+        ValueError: the value is no part, or a flag of submitit's stands without --submitit.
     """
     if args.submitit is None and (args.submitit_cluster or args.submitit_parameters):
         raise ValueError("--submitit_cluster and --submitit_parameters need --submitit=N")
@@ -65,7 +65,7 @@ def check_num_jobs(args: argparse.Namespace, most: int, parts: str) -> None:
 
 
 def write_job_array(command: Sequence[str], num_jobs: int, script: Path) -> None:
-    """Write a SLURM array script whose jobs run the command's parts, and print what submits it."""
+    """Write a SLURM array script whose jobs run the command's parts, and print how to submit it."""
     script.parent.mkdir(parents=True, exist_ok=True)
     script.write_text(sbatch_script(command, num_jobs, Path.cwd()))
     print(shlex.join(["sbatch", str(script)]))
@@ -75,7 +75,7 @@ def write_job_array(command: Sequence[str], num_jobs: int, script: Path) -> None
 def submitted(
     commands: Sequence[Sequence[str]], args: argparse.Namespace, folder: Path
 ) -> "Iterator[list[Job[int]]]":
-    """Jobs of submitit's, for which is waited at the end; Ctrl-C cancels them."""
+    """Submit commands as jobs of submitit, and wait for them at the end; Ctrl-C cancels them."""
     logs = folder / SUBMITIT
     jobs = submit(commands, logs, args.submitit_cluster, args.submitit_parameters) if commands else []
     try:

@@ -55,10 +55,10 @@ def _two_policies(args: argparse.Namespace) -> tuple[list[Record], list[Record]]
 def _by_policy(records: list[Record], names: Sequence[str]) -> list[list[Record]]:
     """Split records by policy name, in order of first appearance.
 
-    A policy answers to its type, its path, `bomb:NAME`, or any part of what `results` says of it.
+    A name is a policy's type, its path, `bomb:NAME`, or any part of its description in `results`.
 
     Raises:
-        ValueError: a name is of no policy, or of several.
+        ValueError: a name fits no policy, or several.
     """
     by_key: dict[str, list[Record]] = {}
     for record in records:

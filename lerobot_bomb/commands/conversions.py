@@ -16,10 +16,10 @@ def add_conversion_arguments(parser: argparse.ArgumentParser, path: str) -> None
 
 
 def new_root(args: argparse.Namespace) -> Path:
-    """Return the folder of a dataset that is written.
+    """Return the folder of the new dataset.
 
     Raises:
-        ValueError: its name is none on the Hub.
+        ValueError: its name is not valid on the Hub.
     """
     check_repo_id(args.repo_id)
     return args.root or default_root(args.repo_id)

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Convert; prints where the dataset is."""
+    """Convert, and print where the dataset is."""
     root = new_root(args)
     from lerobot_bomb.data.libero_conversion import convert_libero
 

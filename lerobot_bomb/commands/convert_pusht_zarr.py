@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Convert; prints where the dataset is."""
+    """Convert, and print where the dataset is."""
     root = new_root(args)
     from lerobot_bomb.data.pusht_conversion import convert_pusht
 

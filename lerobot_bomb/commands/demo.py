@@ -22,7 +22,7 @@ from lerobot_bomb.sweep.manifest import largest_divisor
 from lerobot_bomb.tables import print_table
 
 POLICY = "vla0_smol"
-# one axis, and all ten at once: its training shows both, and the second is where it fails
+# one axis, and all ten at once: the policy was trained on both, and fails under the second
 CONDITIONS = (Condition(), Condition("light:3"), Condition("all:3"))
 SUITE = "place"
 
@@ -154,7 +154,7 @@ def _write_sheet(output_dir: Path, records: list[EpisodeResult]) -> Path:
 
 
 def _tile(video: Path, record: EpisodeResult) -> np.ndarray:
-    """Return both cameras with a caption that is read at this size, which the video's own is not."""
+    """(H, W, 3) images of both cameras above a caption that is legible at this size, unlike the video's."""
     from PIL import Image
 
     from lerobot_bomb.viewing.sheet import caption

@@ -1,4 +1,4 @@
-"""``lerobot-bomb doctor``: imports every part loudly and says what is broken.
+"""``lerobot-bomb doctor``: imports every part and says what is broken.
 
 LeRobot swallows a plugin's import errors and then only says ``invalid choice``; this command shows them.
 """
@@ -20,7 +20,7 @@ from lerobot_bomb.environments import ENVIRONMENTS
 from lerobot_bomb.libero.assets import INSTALL, SUITES, Libero, describe_missing_assets
 
 DISTRIBUTION = "lerobot_policy_bomb"
-# what the names of packages begin with that register a type each
+# prefixes of the packages that register a type each
 ENV_PREFIX, POLICY_PREFIX = "lerobot_env_", "lerobot_policy_"
 DEPENDENCIES = (
     "lerobot",
@@ -33,7 +33,7 @@ DEPENDENCIES = (
     "rerun-sdk",
     "numpy",
 )
-# what it means that a version lies outside the declared range
+# consequence of a version outside the declared range
 OUTSIDE = {"mujoco": ": episodes and images are not those of the protocol, and results do not compare"}
 HUB_TIMEOUT_S = 5
 
@@ -144,7 +144,7 @@ def check_types() -> Iterator[Component]:
 
 
 def _imported_types(plugin: ModuleType, prefix: str) -> list[str]:
-    """The type of each package with this prefix that a module imports: lerobot_policy_act's is act."""
+    """Return the type of each package with this prefix that a module imports: act of lerobot_policy_act."""
     return [name.removeprefix(prefix) for name in vars(plugin) if name.startswith(prefix)]
 
 

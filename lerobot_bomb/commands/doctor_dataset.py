@@ -12,7 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print which statistics are wrong; exit code 3 where some are and stay so."""
+    """Print which statistics are wrong; exit code 3 if some are and are not mended."""
     from lerobot_bomb.data.statistics import mending, write_statistics, wrong_statistics  # LeRobot: seconds
 
     wrong = wrong_statistics(args.root)

@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_images(args: argparse.Namespace, image_size: int) -> None:
-    """Refuse flags of the images before anything is loaded."""
+    """Raise a ValueError for a wrong --fill or --grid, before anything is loaded."""
     from lerobot_bomb.explain.images import FILLINGS, patch_masks  # torch: seconds
 
     one_of("--fill", args.fill, FILLINGS)
@@ -126,7 +126,7 @@ class _Query:
 def _moments(
     args: argparse.Namespace, query: _Query, seed: int, loaded: "LoadedPolicy"
 ) -> "tuple[list[ExplainedMoment], Any]":
-    """Explain an episode's moments that are asked about; return them with the episode's result."""
+    """Explain the chosen moments of an episode; return them with the episode's result."""
     from lerobot_bomb.explain.episode import Settings, explain_moment
     from lerobot_bomb.explain.snapshots import at_step, middle_of_phases, take_snapshots
 
@@ -198,7 +198,7 @@ def _explain_several(args: argparse.Namespace, query: _Query) -> int:
 
 
 def _probes(moments: "Sequence[ExplainedMoment]") -> "list[LayerProbe]":
-    """Probe layers for destination and stone, where enough episodes hold them and the layers' states."""
+    """Probe layers for target and stone; empty if too few episodes hold these and the layers' states."""
     from lerobot_bomb.explain.probes import MIN_EPISODES, probe_layers
 
     known = [each for each in moments if each.states and each.snapshot.target is not None]

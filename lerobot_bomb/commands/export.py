@@ -35,7 +35,7 @@ def _hub_id(text: str) -> str:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write a table for LaTeX, and of each policy what its repository on the Hub takes; print the paths."""
+    """Write a LaTeX table and, for each policy, the files of its Hub repository; print the paths."""
     # huggingface_hub takes a second
     from lerobot_bomb.hub.evaluations import check_one_rate_each, eval_results_yaml, model_index_yaml
 

@@ -14,7 +14,7 @@ from lerobot_bomb.commands.table import COMMANDS, FAMILIES, PROGRAM, RENAMED, ov
 from lerobot_bomb.compat.use import use
 
 SHELLS = ("bash", "zsh")
-# of lerobot-eval, those that are of no group as --env.task is
+# flags of lerobot-eval that have no prefix, as --env.task has
 EVAL_FLAGS = ("--config_path", "--job_name", "--output_dir", "--rename_map", "--seed", "--trust_remote_code")
 
 
@@ -83,7 +83,7 @@ def _split(argv: Sequence[str]) -> tuple[str, Sequence[str]] | None:
 
 
 def _unknown(argv: Sequence[str]) -> int:
-    """Help with words that are no command."""
+    """Print help on words that are no command; return the exit code."""
     word, *others = argv
     if word in FAMILIES and (not others or others[0] in ("-h", "--help")):
         print(*_listed(word), sep="\n")
@@ -123,7 +123,7 @@ def _parse(name: str, words: Sequence[str]) -> argparse.Namespace:
 
 
 def _told() -> tuple[type[Exception], ...]:
-    """Return the errors whose messages are for the user; draccus is there if its own was raised."""
+    """Return the errors whose messages are for the user; draccus' own only once it is loaded."""
     draccus = sys.modules.get("draccus.utils")
     return (ValueError, OSError, RuntimeError, *((draccus.DecodingError,) if draccus else ()))
 

@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _push_dataset(args: argparse.Namespace) -> int:
-    """Check the dataset, publish all of it in one commit and tag it for LeRobot; prints where."""
+    """Check the dataset, publish all of it in one commit and tag it for LeRobot; print the commit's URL."""
     for flag, value in {"--results": args.results, "--dataset.root": args.dataset_root}.items():
         if value:
             raise ValueError(f"{flag} is of a checkpoint, and {args.folder} is a dataset; drop it")
@@ -57,7 +57,7 @@ def _push_dataset(args: argparse.Namespace) -> int:
 
 
 def _push_checkpoint(args: argparse.Namespace) -> int:
-    """Check the checkpoint, then publish all of it in one commit; prints where."""
+    """Check the checkpoint, then publish all of it in one commit; print the commit's URL."""
     results = [read_results(path) for path in args.results]
     if not (args.folder / CONFIG).is_file():
         raise ValueError(

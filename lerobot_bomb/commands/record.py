@@ -105,7 +105,7 @@ def _add_what_is_recorded(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Record; prints which episodes failed and where the dataset is."""
+    """Record episodes; print which failed, and where the dataset is."""
     recording = _recording(args)
     root = args.root or default_root(recording.repo_id)
     shard = shard_of(args)
@@ -145,7 +145,7 @@ def _recording(args: argparse.Namespace) -> Recording:
 
 
 def _print(recording: Recording, progress: Progress, where: Path, num_before: int = 0) -> None:
-    """Print what was recorded, after `num_before` episodes that others tried."""
+    """Print what was recorded, after `num_before` episodes that other parts tried."""
     conditions, scenes = len(recording.conditions), recording.scenes
     first = recording.seed + num_before // conditions * scenes
     end = recording.seed - (-(num_before + progress.num_tried) // conditions) * scenes
@@ -189,7 +189,7 @@ def _record_by_jobs(args: argparse.Namespace, parts: list[Part], root: Path) -> 
 
 
 def _job_command(args: argparse.Namespace, root: Path) -> list[str]:
-    """Records as the given flags say, with --shard a part of it."""
+    """Return the command that records as the flags say; with --shard it records a part."""
     flags = [f"--root={root.absolute()}"]
     for name, value in vars(args).items():
         if name in NOT_OF_JOBS or value in (None, False, ()):
@@ -222,7 +222,7 @@ def _acting_weights(args: argparse.Namespace) -> str | None:
 
 
 def _behavior_policy(recording: Recording, policy_path: Path) -> BehaviorPolicy:
-    """The checkpoint, as lerobot-eval lets it act.
+    """Load the checkpoint, to act as in lerobot-eval.
 
     Raises:
         ValueError: it was trained for another environment.

@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _changed(record: Record, levels: dict[str, int]) -> str:
-    """The condition of an episode with other levels; levels that were drawn stay as they were."""
+    """Return the condition of an episode with other levels; other drawn levels stay as they were."""
     merged = record.levels | levels
     text = "+".join(f"{axis}:{level}" for axis, level in merged.items()) or NONE
     try:

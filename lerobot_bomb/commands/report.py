@@ -77,7 +77,7 @@ def _add_videos(samples: list[Sample], folder: Path, num_of_class: int) -> list[
 
 
 def _csv(sections: list[Section]) -> str:
-    """The rates by condition, a line each."""
+    """Write the rates by condition as CSV, a line each."""
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(["group", "condition", "successes", "n", "low", "high"])

@@ -25,11 +25,11 @@ type Envs = dict[str, dict[int, VectorEnv]]  # {group: {task id: vector env}}, a
 
 
 class LoggedVectorEnv:
-    """A vector env that hands on the actions of each episode when it ends; all else is the env's own.
+    """A vector env that logs the actions of each episode when it ends; all else is the env's own.
 
     Args:
         env: a VectorEnv of B environments, or one of LeRobot's lazy ones, which are no VectorEnv.
-        log: is called with an episode's seed and its actions (T, D), those that `env` was given.
+        log: called with an episode's seed and the actions (T, D) that `env` was given.
     """
 
     def __init__(self, env: Any, log: Callable[[int, np.ndarray], None]) -> None:
@@ -45,7 +45,7 @@ class LoggedVectorEnv:
         return getattr(self._env, name)
 
     def begin_evaluation(self, num_episodes: int, seed: int | None) -> None:
-        """Take in that LeRobot counts the next so many episodes: what fills its last batch is not logged."""
+        """Log only the next `num_episodes` episodes; others just fill LeRobot's last batch."""
         self._num_left = num_episodes
         if begin := getattr(self._env, "begin_evaluation", None):
             begin(num_episodes, seed)
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate; a failure of lerobot-eval is shown with its traceback, as it shows it itself."""
+    """Evaluate; show a failure of lerobot-eval with its traceback, as lerobot-eval does."""
     if args.path.exists():
         raise ValueError(f"{args.path} exists already, and a file holds one evaluation; name another")
     check_writable("FILE", args.path)

@@ -58,10 +58,10 @@ class ResultsFile:
 
 
 def read_record(path: Path, line: int) -> Record:
-    """Return the episode of a line, counted from 1 as an editor counts.
+    """Return the record on a line of a file, counted from 1.
 
     Raises:
-        ValueError: there is no episode on that line, or as `read_undamaged`.
+        ValueError: there is no record on that line; or see `read_undamaged`.
     """
     numbered = read_undamaged(path).numbered
     if line not in numbered:
@@ -72,10 +72,10 @@ def read_record(path: Path, line: int) -> Record:
 
 
 def read_undamaged(path: Path) -> ResultsFile:
-    """Read the episodes of a file; stderr shows its first damaged records and what it lacks.
+    """Read the records of a file; print its first damaged records and missing episodes to stderr.
 
     Raises:
-        ValueError: there is no such file, or no episode in it.
+        ValueError: there is no such file, or no record in it.
     """
     numbered, damages = read_records(path)
     for damage in damages[:MAX_SHOWN_DAMAGES]:

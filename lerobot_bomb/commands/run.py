@@ -1,4 +1,4 @@
-"""Runs commands as a user would type them."""
+"""Run commands as a user would type them."""
 
 import shlex
 import signal
@@ -11,11 +11,11 @@ from pathlib import Path
 def run_command(command: str, *flags: str) -> None:
     """Show a command, then run it from this Python's environment.
 
-    It inherits the files that were made inheritable: a lock is held until it, too, has ended. Ctrl-C is for
-    this process alone, which then ends the command: no traceback of it is shown.
+    The command inherits files that were made inheritable, so a lock is held until it, too, has ended. It
+    ignores Ctrl-C, on which this process ends it: no traceback of it is shown.
 
     Raises:
-        RuntimeError: it ended with another exit code than 0.
+        RuntimeError: the command ended with another exit code than 0.
     """
     print(shlex.join([command, *flags]), flush=True)
     path = Path(sys.executable).with_name(command)

@@ -32,7 +32,7 @@ WARNING = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags of LeRobot's policy_server, and who may come."""
+    """Declare the flags of LeRobot's policy_server, and who may connect."""
     parser.description = WARNING
     add = parser.add_argument
     for name, (default, about) in SERVER_FLAGS.items():
@@ -73,7 +73,7 @@ def _address(args: argparse.Namespace) -> Iterator[str]:
     """Yield the address to listen on, as gRPC names it; a socket is removed afterwards.
 
     Raises:
-        ValueError: it is in use, or other machines would reach it.
+        ValueError: the address is in use, or other machines would reach it.
     """
     if args.socket is None:
         _check_port(args.host, args.port, args.allow_network)
@@ -90,7 +90,7 @@ def _address(args: argparse.Namespace) -> Iterator[str]:
 
 
 def _check_port(host: str, port: int, allow_network: bool) -> None:
-    """Raise a ValueError unless it is free, and on this machine or allowed."""
+    """Raise a ValueError unless the port is free and, without `allow_network`, open to this machine only."""
     try:
         with socket.create_server((host, port)) as listener:
             address = ip_address(listener.getsockname()[0])

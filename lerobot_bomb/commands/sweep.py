@@ -129,7 +129,7 @@ def _jobs(args: argparse.Namespace, manifest: Manifest) -> list[Job]:
 
 
 def _manifest(args: argparse.Namespace) -> Manifest:
-    """Return the wanted manifest: that of the flags or, without --policies, that of the folder."""
+    """Return the manifest of the flags or, without --policies, that of the folder."""
     if args.policies is None:
         if not (args.folder / NAME).is_file():
             raise ValueError(
@@ -160,7 +160,7 @@ def _record_type(flags: list[str]) -> type[Record]:
 
 
 def _check_types(policies: Sequence[str], flags: Sequence[str]) -> None:
-    """Raise a ValueError if one is neither a checkpoint nor a type that there is, as far as source says."""
+    """Raise a ValueError if a policy is no checkpoint and no registered type, as far as source shows."""
     types = [policy for policy in policies if policy_flag(policy).startswith("--policy.type=")]
     known = _registered("policies", flags) if types else None
     for name in types:
@@ -168,7 +168,7 @@ def _check_types(policies: Sequence[str], flags: Sequence[str]) -> None:
 
 
 def _registered(kind: str, flags: Sequence[str]) -> set[str] | None:
-    """Return the types that there are; None where a package that is imported later may add some."""
+    """Return the registered types; None if a package that is imported later may add some."""
     return None if any("discover_packages_path" in flag for flag in flags) else registered_types(kind)
 
 
@@ -179,7 +179,7 @@ def _check_known(refusal: str, name: str, known: set[str] | None) -> None:
 
 
 def _expanded(perturbations: tuple[str, ...], record_type: type[Record]) -> Sequence[str]:
-    """The conditions, checked for the environment."""
+    """Expand the conditions, and check them for the environment."""
     name = record_type.env_type
     if perturbations and not record_type.condition.axes:
         others = f"; --env.type=bomb_{name} has" if f"bomb_{name}" in ENVIRONMENTS else ""
@@ -188,7 +188,7 @@ def _expanded(perturbations: tuple[str, ...], record_type: type[Record]) -> Sequ
 
 
 def _part_command(args: argparse.Namespace) -> list[str]:
-    """Return the command that runs a part of the folder's jobs, with --shard."""
+    """Return the command that runs the folder's jobs; with --shard it runs a part."""
     command = [*PYTHON, "lerobot_bomb.commands.main", "sweep", str(args.folder.absolute())]
     command += [f"--workers={args.workers}"]
     return command + ([f"--timeout={args.timeout}"] if args.timeout else [])

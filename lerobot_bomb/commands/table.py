@@ -1,14 +1,14 @@
 """Commands of ``lerobot-bomb``: group, name, summary and two examples of each.
 
-A command of one word or two, ``checkpoint init``, is the module ``checkpoint_init`` in this folder, with
-``add_arguments`` and ``run``. The module is imported when it is called, and imports neither torch nor LeRobot
-itself.
+A command such as ``checkpoint init`` is the module ``checkpoint_init`` in this folder, with
+``add_arguments`` and ``run``. The module is imported when the command is called; its own imports are neither
+torch nor LeRobot.
 """
 
 from dataclasses import dataclass, field
 
 PROGRAM = "lerobot-bomb"
-# a group; a command; an example, without what the command is called
+# a group; a command; an example, without the command's name
 TABLE = """
 Datasets and episodes
   record: record the scripted expert as a LeRobotDataset

@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def viewed_of(args: argparse.Namespace) -> Viewed:
-    """Return the episode that `add_viewed_arguments` lets a user name."""
+    """Return the episode that the flags of `add_viewed_arguments` choose."""
     one_of("--env.type", args.env_type, _viewed_types())
     for name, (default, env_types) in args.own_flags.items():
         value = getattr(args, name)
@@ -123,7 +123,7 @@ def _policy(args: argparse.Namespace, policies: tuple[str, ...]) -> str:
 def _agent(
     args: argparse.Namespace, policy: str, viewed: Viewed, paths: list[Path], env: gymnasium.Env
 ) -> Iterator[Agent]:
-    """Yield the agent that acts; an error about existing files comes last."""
+    """Yield the agent that acts; after all other errors, refuse files that exist."""
     seed = viewed.spec.seed
     if policy in (EXPERT, RANDOM):
         check_new(paths)

@@ -1,5 +1,5 @@
-"""Code that reaches into LeRobot, draccus or huggingface_hub and replaces their functions; all of it is here.
+"""Code that replaces functions of LeRobot, draccus or huggingface_hub; all of it is here.
 
-`hooks` stand in them for a user of our types; but for `hooks.paths` none does before a first use (`use`).
-`own` is for as long as one of our commands runs.
+`hooks` are for a user of our types; all but `hooks.paths` are installed on first use (`use`). `own` lasts as
+long as one of our commands runs.
 """

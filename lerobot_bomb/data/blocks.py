@@ -1,7 +1,7 @@
 """Blocks of a growing dataset: small finished LeRobotDatasets, merged into one at the end.
 
-LeRobot's parquet files can be read only after `finalize`, so a dataset that is killed while it is
-written is lost. Blocks bound that loss to the episodes of one block, which are made again.
+LeRobot's parquet files can be read only after `finalize`, so a dataset is lost if its
+writer is killed. Blocks bound that loss to the episodes of one block, which are made again.
 """
 
 import gc
@@ -55,7 +55,7 @@ class DatasetLayout:
     arrays: tuple[str, ...] = ()
 
     def create(self, root: Path) -> LeRobotDataset:
-        """An empty dataset that is ready to be written."""
+        """Create an empty dataset that is ready to be written."""
         return LeRobotDataset.create(
             self.repo_id,
             fps=self.fps,
@@ -113,7 +113,7 @@ def merge_blocks(layout: DatasetLayout, blocks: list[Path], root: Path) -> None:
 
     Videos and tables are joined up to LeRobot's file sizes. Tables that hold images or depth stay one per
     block: they are large, and LeRobot holds a table in memory as Python objects. Statistics of numbers are
-    those of all frames; of images, what follows from those of all episodes.
+    those of all frames; statistics of images follow from those of all episodes.
 
     Raises:
         OSError: the disk is full.
@@ -160,7 +160,7 @@ def _temporary_files_beside(root: Path) -> Iterator[None]:
     try:
         yield
     except BaseException as error:
-        # a video that was being joined is among the locals of its frames; PyAV finishes it when it is
+        # the error's frames may hold a video that was being joined; PyAV finishes it when it is
         # collected, and prints a traceback unless its file is still there
         traceback.clear_frames(error.__traceback__)
         gc.collect()
@@ -184,7 +184,7 @@ def _logged_errors() -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError) as error:
-        # what is raised later may only be its consequence: an image that cannot be read
+        # a later error may only be its consequence: an image that cannot be read
         raise RuntimeError(handler.errors[0] if handler.errors else str(error)) from error
     finally:
         logger.removeHandler(handler)
@@ -208,7 +208,7 @@ class _ErrorCollector(logging.Handler):
 
 
 def _write_episodes(dataset: LeRobotDataset, episodes: Iterable[RecordedEpisode]) -> list[dict[str, Any]]:
-    """Write them all and return their columns."""
+    """Write all episodes, finish the dataset, and return the episodes' columns."""
     rows = []
     try:
         for episode in episodes:
@@ -228,7 +228,7 @@ def _write_episode(dataset: LeRobotDataset, episode: RecordedEpisode) -> None:
 
 
 def _add_episode_columns(root: Path, rows: list[dict[str, Any]]) -> None:
-    """Add what determines each episode to LeRobot's table of episodes.
+    """Add the columns of each episode to LeRobot's table of episodes.
 
     Columns follow their episodes through load, filter, merge and push; a file beside the table would
     be separated from them by a merge.
@@ -243,7 +243,7 @@ def _add_episode_columns(root: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def check_encoded_frames(root: Path, cameras: Sequence[str], num_frames: int) -> None:
-    """Raise if the encoder dropped frames or did not finish them, which LeRobot only logs."""
+    """Raise a RuntimeError if the encoder dropped frames or did not finish them, which LeRobot only logs."""
     encoded = dict.fromkeys(cameras, 0)
     for path in sorted(root.glob("videos/*/*/*.mp4")):
         with av.open(str(path)) as video:

@@ -20,8 +20,8 @@ EPISODE_INDEX = "episode_index"
 
 
 def read_meta(repo_id: str, root: Path | None) -> LeRobotDatasetMetadata:
-    """A dataset's metadata; a folder that is named must exist, LeRobot's own may be filled from the Hub."""
-    if root is None:  # else it is but a label
+    """Read a dataset's metadata; a given folder must exist, LeRobot's own may be filled from the Hub."""
+    if root is None:  # with a folder, it is but a label
         check_repo_id(repo_id, "--dataset.repo_id")
         check_tokens_before_use(check_token_characters)
         explain_missing_datasets(describe_missing_dataset)
@@ -32,7 +32,7 @@ def read_meta(repo_id: str, root: Path | None) -> LeRobotDatasetMetadata:
 
 
 def present_episodes(meta: LeRobotDatasetMetadata) -> list[int]:
-    """Episodes whose data files are here: LeRobot downloads those of --dataset.episodes only."""
+    """Return the episodes whose data files are here: LeRobot downloads those of --dataset.episodes only."""
     present = [i for i in range(meta.total_episodes) if (meta.root / meta.get_data_file_path(i)).is_file()]
     if not present:
         raise ValueError(
@@ -43,7 +43,7 @@ def present_episodes(meta: LeRobotDatasetMetadata) -> list[int]:
 
 
 def check_chunk_length(chunk_size: int, meta: LeRobotDatasetMetadata) -> None:
-    """Raise a ValueError unless an episode of a dataset is as long as a chunk."""
+    """Raise a ValueError unless an episode of a dataset is at least as long as a chunk."""
     lengths = [] if meta.episodes is None else meta.episodes["length"]
     longest = max(lengths, default=chunk_size)
     if chunk_size > longest:
@@ -54,9 +54,9 @@ def check_chunk_length(chunk_size: int, meta: LeRobotDatasetMetadata) -> None:
 
 
 def require_motion(meta: LeRobotDatasetMetadata, use: str) -> None:
-    """Raise a ValueError, which names the use, if frames of a dataset do not follow each other.
+    """Raise a ValueError that names the use if a dataset holds static scenes.
 
-    They are static scenes, which `lerobot-bomb record --static` writes: `next.done` holds before the end.
+    Frames of `lerobot-bomb record --static` do not follow each other; `next.done` is true before the end.
     """
     if DONE not in meta.features:
         return
@@ -75,7 +75,7 @@ def read_columns(
 ) -> dict[str, np.ndarray]:
     """{key: (N, ...)} of N frames in the dataset's order, `episode_index` (N,) always among them.
 
-    Features of whole numbers or truth values are float64: what is computed of them has fractions.
+    Integer and boolean features are float64: what is computed from them has fractions.
 
     Reads the data files under ``meta.root``; ``LeRobotDataset`` downloads them if they are not there.
 
@@ -109,7 +109,7 @@ def read_columns(
 
 
 def dim_names(feature: dict[str, Any]) -> list[str]:
-    """Names of a feature's dimensions; numbers where the dataset has no names."""
+    """Return the names of a feature's dimensions; their numbers if the dataset has no names."""
     names = feature.get("names") or []
     if isinstance(names, dict):
         names = [name for group in names.values() for name in (group if isinstance(group, list) else [group])]
@@ -118,7 +118,7 @@ def dim_names(feature: dict[str, Any]) -> list[str]:
 
 
 def episode_bounds(episode_index_N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) sorted -> first row of each row's episode and the row after its last one, (N,) each."""
+    """Sorted episodes (N,) of rows -> first row of each's episode and the row after its last, (N,) each."""
     return (
         np.searchsorted(episode_index_N, episode_index_N, side="left"),
         np.searchsorted(episode_index_N, episode_index_N, side="right"),

@@ -72,10 +72,10 @@ def check_readable(root: Path) -> None:
 
 
 def read_info(root: Path) -> Info:
-    """info.json of a dataset, with counts, rate and features that can be ones.
+    """Read info.json of a dataset, and check its counts, rate and features.
 
     Raises:
-        OSError, ValueError: it is missing, truncated, or says something else.
+        OSError, ValueError: the file is missing or truncated, or lacks one of these.
     """
     info = read_json(root / INFO_FILE)
     features = info.get("features")
@@ -93,7 +93,7 @@ def read_info(root: Path) -> Info:
 
 
 def read_parquet(path: Path, columns: Sequence[str] | None = None, filters: list | None = None) -> pa.Table:
-    """A table, or some of its columns, or those of its rows that pass pyarrow's filters.
+    """Read a table, or some of its columns, or the rows that pass pyarrow's filters.
 
     Raises:
         FileNotFoundError: there is none.
@@ -118,7 +118,7 @@ def check_video(path: Path, num_frames: int, fps: float) -> None:
 
     Raises:
         FileNotFoundError: there is none.
-        ValueError: it is truncated, or shorter or longer.
+        ValueError: it is truncated, or has another number of frames.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path} is missing")
@@ -139,10 +139,10 @@ def check_video(path: Path, num_frames: int, fps: float) -> None:
 
 
 def read_episodes(root: Path, info: Info) -> pa.Table:
-    """The table of episodes, by their index.
+    """Read the table of episodes, in the order of their index.
 
     Raises:
-        OSError, ValueError: a file is missing or damaged, or they are not those of info.json.
+        OSError, ValueError: a file is missing or damaged, or the episodes are not those of info.json.
     """
     files = sorted((root / EPISODES_FOLDER).rglob("*.parquet"))
     if not files:
@@ -274,7 +274,7 @@ def _check_data(root: Path, info: Info, episodes: pa.Table) -> None:
 def _files(
     root: Path, info: Info, template: str, episodes: pa.Table, prefix: str, video_key: str | None = None
 ) -> list[tuple[Path, np.ndarray]]:
-    """Paths of all files of a kind in order, each with the rows of its episodes."""
+    """Return the path of each file of a kind, in order, with the rows of its episodes in their table."""
     chunks = _column(episodes, f"{prefix}chunk_index", root)
     files = _column(episodes, f"{prefix}file_index", root)
     found = []

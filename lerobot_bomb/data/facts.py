@@ -20,9 +20,9 @@ SPEC_COLUMN = "bomb/spec"  # of LeRobot's table of episodes
 
 @dataclass(frozen=True)
 class DatasetFacts:
-    """LeRobot's info.json and, of datasets that this package wrote, bomb.json or its episodes' own columns.
+    """LeRobot's info.json and, for datasets that this package wrote, bomb.json or the episodes' columns.
 
-    Of LeRobot's tools for editing, those that write a new dataset lose bomb.json; some keep the columns.
+    LeRobot's editing tools lose bomb.json when they write a new dataset; some keep the columns.
     """
 
     info: dict[str, Any]
@@ -57,12 +57,12 @@ class DatasetFacts:
 
     @property
     def environment(self) -> Environment | None:
-        """Environment of BOMB that the dataset shows; None if it shows another."""
+        """BOMB environment of the dataset; None if it has another."""
         return Environment.of_dataset(self.info, *self._tasks)
 
     @property
     def _tasks(self) -> tuple[str | None, tuple[int, ...] | None]:
-        """Return `Environment.task` and `Environment.task_ids`; numbers of several suites tell no tasks."""
+        """Return `Environment.task` and `Environment.task_ids`; None for the numbers of several suites."""
         if self.recording:
             given = tuple(self.recording.get("task_ids", ()))
             return self.recording.get("task"), numbered_tasks([self.recording]) or given
@@ -72,7 +72,7 @@ class DatasetFacts:
         return suites[0], numbered_tasks(self.specs or ())
 
     def eval_flags(self) -> list[str] | None:
-        """Return lerobot-eval's flags for the environment that the dataset shows; None if unknown."""
+        """Return lerobot-eval's flags for the dataset's environment; None if unknown."""
         conversion = self.bomb.get("conversion", {})
         if conversion.get("source", "").startswith(PUSHT_SOURCE):
             return ["--env.type=pusht", "--eval.use_async_envs=false"]
@@ -81,7 +81,7 @@ class DatasetFacts:
         return None if self.environment is None else self.environment.eval_flags()
 
     def _libero_flags(self, suite: str) -> list[str]:
-        """Images as large as the dataset's: LeRobot's default is another size."""
+        """Return the flags for images as large as the dataset's: LeRobot's default is another size."""
         height, width, _ = self.info["features"]["observation.images.image"]["shape"]
         size = [f"--env.observation_height={height}", f"--env.observation_width={width}"]
         return ["--env.type=libero", *([f"--env.task={suite}"] if suite else []), *size]

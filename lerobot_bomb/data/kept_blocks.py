@@ -34,7 +34,7 @@ class Progress:
         return self.num_episodes + len(self.failures)
 
     def __add__(self, other: "Progress") -> "Progress":
-        """Return that of both, one after the other."""
+        """Return the progress of both, one after the other."""
         num_frames = self.num_frames + other.num_frames
         return Progress(self.num_episodes + other.num_episodes, num_frames, self.failures + other.failures)
 
@@ -45,7 +45,7 @@ def block_path(folder: Path, number: int) -> Path:
 
 
 def finished_blocks(*folders: Path) -> list[Path]:
-    """Folders of the finished blocks, by their numbers; {} if the dataset's folder is missing."""
+    """Folders of the finished blocks, by their numbers; [] if the dataset's folder is missing."""
     paths = (path for folder in folders for path in folder.glob("block-*"))
     return sorted((path for path in paths if BLOCK.fullmatch(path.name)), key=_number)
 
@@ -60,7 +60,7 @@ def reached(*folders: Path) -> Progress:
 
 
 def episodes_before(folder: Path, number: int) -> int:
-    """Return how many are in a folder's finished blocks of smaller numbers."""
+    """Return how many episodes are in a folder's finished blocks of smaller numbers."""
     blocks = [block for block in finished_blocks(folder) if _number(block) < number]
     return sum(read_progress(block / BLOCK_FILE).num_episodes for block in blocks)
 
@@ -73,7 +73,7 @@ def finish_block(unfinished: Path, block: Path, progress: Progress) -> None:
 
 
 def find_gaps(folder: Path, numbers: range) -> list[range]:
-    """Return the numbers of the missing blocks, as the longest ranges."""
+    """Return the missing blocks' numbers, joined into ranges."""
     there = [number for number in map(_number, finished_blocks(folder)) if number in numbers]
     starts, ends = [numbers.start, *(number + 1 for number in there)], [*there, numbers.stop]
     return [range(start, end) for start, end in zip(starts, ends, strict=True) if start < end]
@@ -87,7 +87,7 @@ def damaged_blocks(folder: Path, numbers: range) -> dict[Path, str]:
 
 
 def block_damage(block: Path) -> str | None:
-    """Return what is wrong with a block; None: nothing."""
+    """Return what is wrong with a block; None if nothing is."""
     if not block.exists():
         return "is missing"
     try:
@@ -116,7 +116,7 @@ def _digests(block: Path) -> dict[str, str]:
 
 
 def read_progress(path: Path) -> Progress:
-    """Progress from a block's or a dataset's file.
+    """Read the progress from a block's or a dataset's file.
 
     Raises:
         ValueError: it holds none.

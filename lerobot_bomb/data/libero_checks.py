@@ -1,7 +1,7 @@
 """Checks of a file of LIBERO's demonstrations, and the timing of its rows.
 
-data/demo_N of each: actions (T, 7), x, y, z, three of rotation and gripper, each in -1..1; states (T, n), the
-simulator's before each action; obs/agentview_rgb and obs/eye_in_hand_rgb (T, H, W, 3) uint8; obs/ee_pos
+Each data/demo_N holds actions (T, 7) in -1..1: x, y, z, three of rotation, gripper; states (T, n) of the
+simulator before each action; obs/agentview_rgb and obs/eye_in_hand_rgb (T, H, W, 3) uint8; obs/ee_pos
 (T, 3) in metres; obs/ee_ori (T, 3), axis-angle; obs/gripper_states (T, 2) in metres; obs/joint_states (T, 7)
 in radians.
 """
@@ -27,10 +27,10 @@ MAX_JOINT_DIFFERENCE_RAD = 0.05  # replays of recorded actions depart a little
 class Timing:
     """Timing of a demonstration: was a row's observation taken before or after its action?"""
 
-    # largest difference of any joint from the simulator's state of the same row, of the next; median of rows
+    # largest difference of a joint from the simulator's state of the same row, of the next; median over rows
     same_row_rad: float
     next_row_rad: float
-    # how far the fingers open under +1 plus how far they close under -1, if observed before, if after
+    # how far the fingers open under +1 plus how far they close under -1, if observed before it, if after
     opening_before_m: float
     opening_after_m: float
 
@@ -53,7 +53,7 @@ def are_after(file: Path, timings: Sequence[Timing]) -> bool:
     """Return True if observations were taken after their row's action, as in the published files.
 
     Raises:
-        ValueError: its observations are of no row of the simulator's states, or +1 opens the gripper.
+        ValueError: observations match no row of the simulator's states, or +1 opens the gripper.
     """
     same_row = float(np.median([timing.same_row_rad for timing in timings]))
     next_row = float(np.median([timing.next_row_rad for timing in timings]))
@@ -73,7 +73,7 @@ def are_after(file: Path, timings: Sequence[Timing]) -> bool:
 
 
 def checked_values(where: str, demo: Any, image_shape: Sequence[int]) -> dict[str, np.ndarray]:
-    """Return all numbers of a demonstration, checked; of its images, only check that they are there."""
+    """Check a demonstration, without reading its images; return its numbers, {name: (T, n)}."""
     widths = {"actions": ACTION_DIM, "states": None, f"obs/{JOINTS}": NUM_JOINTS}
     widths |= {f"obs/{name}": width for name, width in STATE.items()}
     for name in (*widths, *(f"obs/{camera}" for camera in CAMERAS)):

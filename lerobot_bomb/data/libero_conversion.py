@@ -1,4 +1,4 @@
-"""LIBERO's demonstrations as a LeRobotDataset as LeRobot's environment `libero` would show them."""
+"""LIBERO's demonstrations as a LeRobotDataset, as LeRobot's environment `libero` would show them."""
 
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -83,7 +83,7 @@ def convert_libero(
 
 
 def _layout(repo_id: str, image_shape: tuple[int, int, int], use_videos: bool) -> "DatasetLayout":
-    """The keys under which a policy sees LeRobot's environment `libero`."""
+    """Return the layout, with the keys under which a policy sees LeRobot's environment `libero`."""
     from lerobot_bomb.data.blocks import DatasetLayout
 
     camera = {
@@ -100,7 +100,7 @@ def _layout(repo_id: str, image_shape: tuple[int, int, int], use_videos: bool) -
 
 
 def _recorded_episode(source: LiberoHdf5, index: int) -> "RecordedEpisode":
-    """A demonstration's frames, and in the table of episodes where it is from."""
+    """Return a demonstration's frames; columns tell its file and name."""
     from lerobot_bomb.data.blocks import RecordedEpisode
 
     demonstration, place = source.episode(index), source.sources[index]

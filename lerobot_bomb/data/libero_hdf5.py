@@ -1,8 +1,8 @@
 """LIBERO's demonstrations as they are published: a file TASK_demo.hdf5 of each task, or a folder of them.
 
-What is read differs from what a file holds (see `libero_checks.py`) in three ways, so that it is what
-`lerobot-eval --env.type=libero` shows a policy: images are turned, an action stands beside the observation
-before it, and the task is named as hf-libero names it, after the task's file.
+Three things differ from a file's content (see `libero_checks.py`), to match what `lerobot-eval
+--env.type=libero` shows a policy: images are turned, an action stands beside the observation before it, and
+the task is named as hf-libero names it, after the task's file.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ DATASETS_REPO = "yifengzhu-hf/LIBERO-datasets"
 # how a file's images are turned to those of LeRobot: over rows, columns
 CONVENTIONS = {"opengl": (-1, -1), "opencv": (1, -1), "lerobot": (1, 1)}
 SUFFIX = "_demo"
-NOOP_MAX = 1e-4  # norm of the six that move the arm, as OpenVLA filters LIBERO
+NOOP_MAX = 1e-4  # norm of the six dims that move the arm, as OpenVLA filters LIBERO
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class LiberoHdf5:
     """The demonstrations of a file or a folder; `check` must have passed before they are read.
 
     Args:
-        path: of TASK_demo.hdf5, or of a folder that holds some.
-        convention: of `CONVENTIONS`, in which images were stored; None: what each file says, else opengl.
+        path: a file TASK_demo.hdf5, or a folder of such files.
+        convention: one of `CONVENTIONS`, in which images were stored; None: what each file says, else opengl.
         skip_noops: leave frames out in which neither arm nor gripper is told to move.
 
     Raises:
@@ -64,7 +64,7 @@ class LiberoHdf5:
         self.tasks: dict[Path, str] = {}
         self._suites: set[str] = set()
         self._conventions: dict[Path, str] = {}
-        self._is_after: dict[Path, bool] = {}  # whether an observation is of after the action in its row
+        self._is_after: dict[Path, bool] = {}  # whether observations were taken after their row's action
         for file in self.files:
             with _opened(file) as data:
                 self._conventions[file] = convention or _convention(file, data)
@@ -79,7 +79,7 @@ class LiberoHdf5:
 
     @property
     def suite(self) -> str:
-        """LIBERO's name of the suite that all files are of; empty: several, or not known."""
+        """Name of the suite of all files; empty if there are several, or it is unknown."""
         suite, *others = self._suites
         return suite if not others and suite in SUITES else ""
 
@@ -99,7 +99,7 @@ class LiberoHdf5:
         return digest.hexdigest()
 
     def check(self) -> None:
-        """Read all but the images once.
+        """Read and check everything but the images once.
 
         Raises:
             ValueError: names the demonstration that lacks something or holds what LIBERO's cannot.
@@ -108,7 +108,7 @@ class LiberoHdf5:
             self._is_after[file] = self._check_file(file)
 
     def episode(self, index: int) -> Demonstration:
-        """A demonstration, of one frame less than its actions where observations were stored after them."""
+        """Return a demonstration; it loses a frame if observations were stored after their actions."""
         source = self.sources[index]
         rows, columns = CONVENTIONS[self._conventions[source.file]]
         with _opened(source.file) as data:
@@ -125,7 +125,7 @@ class LiberoHdf5:
         )
 
     def _check_file(self, file: Path) -> bool:
-        """Check all demonstrations of a file; return whether its observations are of after their actions."""
+        """Check all demonstrations of a file; return True if observations were taken after their actions."""
         with _opened(file) as data:
             timings = []
             for name in [source.name for source in self.sources if source.file == file]:
@@ -146,7 +146,7 @@ def instruction(task: str) -> str:
 
 
 def noops(actions: np.ndarray) -> np.ndarray:
-    """(T, 7) -> (T,) bool: neither arm nor gripper gets a new command."""
+    """Actions (T, 7) -> (T,) bool: neither arm nor gripper gets a new command."""
     still = np.linalg.norm(actions[:, :-1], axis=1) < NOOP_MAX
     found = np.zeros(len(actions), dtype=bool)
     told = None
@@ -157,7 +157,7 @@ def noops(actions: np.ndarray) -> np.ndarray:
 
 
 def _pairs(num_actions: int, is_after: bool) -> tuple[slice, slice]:
-    """Rows of observations, and of the actions that were chosen on them."""
+    """Return the rows of observations, and those of the actions that were chosen on them."""
     return (slice(0, num_actions - 1), slice(1, num_actions)) if is_after else (slice(None), slice(None))
 
 
@@ -178,7 +178,7 @@ def _find_files(path: Path) -> list[Path]:
 
 @contextmanager
 def _opened(file: Path) -> Iterator[Any]:
-    """The group `data` of a file."""
+    """Yield the group `data` of a file."""
     h5py = _import_h5py()
     try:
         opened = h5py.File(file, "r")
@@ -231,6 +231,6 @@ def _convention(file: Path, data: Any) -> str:
 
 
 def _task_file(file: Path, data: Any) -> Path:
-    """The task's BDDL file as the file names it, else as its own name does."""
+    """Return the task's BDDL file, which the file's attribute names, or else its own name."""
     named = data.attrs.get("bddl_file_name")
     return Path(str(named)) if named else file.with_name(f"{file.stem.removesuffix(SUFFIX)}.bddl")

@@ -3,8 +3,8 @@
     NAME.parts/0-of-8.recording/    blocks 0, 1, ... of it, as NAME.recording holds them
     NAME.recording/                 what the join makes: a short last block, more for failed episodes
 
-A block has the successful ones of the episodes that are its own to try, so the joined dataset has the bytes
-of one that was recorded at once.
+A block tries episodes of its own and holds those that succeed, so the joined dataset has the bytes of one
+that was recorded at once.
 """
 
 import re
@@ -32,7 +32,7 @@ FOLDER = re.compile(r"(\d+)-of-(\d+)\.recording")
 
 @dataclass(frozen=True)
 class Part:
-    """Blocks in a row of a recording, about as many as each other part has."""
+    """Consecutive blocks of a recording, about as many as in each other part."""
 
     kind: ClassVar[str] = "recording"
 
@@ -49,17 +49,17 @@ class Part:
 
     @property
     def blocks(self) -> range:
-        """Return the numbers of its blocks; those after the last whole one are the join's."""
+        """Return the numbers of the part's blocks; the join makes those after the last whole one."""
         whole = num_whole_blocks(self.recording)
         return range(whole * self.index // self.number, whole * (self.index + 1) // self.number)
 
     def folder(self, root: Path) -> Path:
-        """Return the folder where it grows, and stays until it is joined."""
+        """Return the folder where the part grows, and stays until it is joined."""
         return parts_folder(root) / f"{self.index}-of-{self.number}.recording"
 
 
 def num_whole_blocks(recording: Recording) -> int:
-    """Return how many it has if no episode fails."""
+    """Return the number of whole blocks of a recording in which no episode fails."""
     return recording.episodes // len(block_episodes(0))
 
 
@@ -177,7 +177,7 @@ def _whole_parts(recording: Recording, root: Path) -> list[Part]:
 
 
 def _found(root: Path) -> list[tuple[int, int]]:
-    """(which, of how many) of the parts that were begun."""
+    """Return (index, number of parts) of the parts that were begun."""
     matches = map(FOLDER.fullmatch, (path.name for path in parts_folder(root).glob("*.recording")))
     found = sorted((int(match[1]), int(match[2])) for match in matches if match)
     return [(index, number) for index, number in found if index < number]

@@ -73,7 +73,7 @@ def convert_pusht(
 
 
 def _pusht_layout(repo_id: str) -> "DatasetLayout":
-    """The keys under which a policy sees LeRobot's environment `pusht`; images, since video is not exact."""
+    """Return the layout, with the keys of LeRobot's environment `pusht`; images, since video is not exact."""
     from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
     from lerobot_bomb.data.blocks import DatasetLayout
@@ -88,7 +88,7 @@ def _pusht_layout(repo_id: str) -> "DatasetLayout":
 
 
 def _pusht_episode(source: PushtZarr, task: str, index: int) -> "RecordedEpisode":
-    """Return an episode: all demonstrations by number, then a copy of each, and so on."""
+    """Return an episode by its number: all demonstrations, then a copy of each, and so on."""
     from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
     from lerobot_bomb.data.blocks import RecordedEpisode

@@ -92,7 +92,7 @@ class PushtZarr:
         return digest.hexdigest()
 
     def check(self) -> None:
-        """Read every chunk once.
+        """Read and check every chunk once.
 
         Raises:
             ValueError: names the file that is missing or cannot be decoded, or holds what PushT cannot have.
@@ -135,7 +135,7 @@ class PushtZarr:
         return ends
 
     def _read_chunk(self, name: str, chunk: tuple[int, ...]) -> np.ndarray:
-        """The values of one chunk; zarr itself takes a missing file for zeros."""
+        """Read the values of one chunk; zarr itself takes a missing file for zeros."""
         file = self._present_file(name, chunk)
         try:
             return np.asarray(self._arrays[name].get_block_selection(chunk))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 
 ANY_NUMBER = sys.maxsize
-# the expert counts as broken when, after so many seeds, fewer succeed
+# the expert counts as broken if, after so many episodes, fewer succeed
 MIN_TRIED = 20
 MIN_SUCCESS_RATE = 0.1
 
@@ -67,9 +67,9 @@ def record_blocks(
     numbers: range = range(ANY_NUMBER),
     most: int = ANY_NUMBER,
 ) -> None:
-    """Make the missing ones of the numbered blocks, until the folder holds `most` episodes.
+    """Make the missing blocks among `numbers`, until the folder holds `most` episodes.
 
-    A block has the successful ones of the episodes that are its own to try, whoever makes it.
+    A block tries episodes of its own and holds those that succeed, whoever makes it.
     """
     gaps = [gap for gap in missing_blocks(folder, numbers) if episodes_before(folder, gap.start) < most]
     if not gaps:
@@ -109,7 +109,7 @@ def _fill(
 def _successes(
     run: Progress, bar: tqdm, pool: Iterable[Rollout], most: int, progress: Progress
 ) -> "Iterator[RecordedEpisode]":
-    """Yield a block's successful rollouts, at most `most`; note the failed ones on the way."""
+    """Yield a block's successful rollouts, at most `most`; count the failed ones on the way."""
     from lerobot_bomb.data.rollout_dataset import rollout_episode
 
     for rollout in islice(pool, len(block_episodes(0))):
@@ -137,7 +137,7 @@ def _check_success_rate(progress: Progress) -> None:
 
 
 def describe_failures(failures: list[dict[str, Any]]) -> str:
-    """One line that counts the failed episodes, with their classes and seeds."""
+    """Count the failed episodes in one line, with their classes and seeds."""
     if not failures:
         return "No episode failed."
     seeds: dict[str, list[str]] = {}
@@ -150,7 +150,7 @@ def describe_failures(failures: list[dict[str, Any]]) -> str:
 
 
 def recording_layout(recording: Recording) -> "DatasetLayout":
-    """Return how the dataset of a recording is laid out."""
+    """Return the layout of a recording's dataset."""
     from lerobot_bomb.data.rollout_dataset import rollout_layout
 
     return rollout_layout(recording)

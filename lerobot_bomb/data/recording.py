@@ -1,4 +1,4 @@
-"""A recording: what determines it."""
+"""Parameters of a recording, and the episodes that it tries."""
 
 import itertools
 import json
@@ -18,7 +18,7 @@ from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.flags import one_of, rewording_errors
 from lerobot_bomb.results.origin import installed_version
 
-SCENES = 100  # static ones that are stored as an episode
+SCENES = 100  # static scenes that are stored as an episode
 MAX_NOISE = 1.0  # beyond it the noise exceeds the largest action
 
 
@@ -50,7 +50,7 @@ class Recording:
     noise: float = 0.0
     # scenes instead of episodes: boards as they may stand midway, a frame each, which belongs to no other
     static: int = 0
-    # SHA-256 of the weights of the policy that acts in the expert's place, who labels what it sees
+    # SHA-256 of the weights of the policy that acts, while the expert labels
     relabel: str | None = None
     # whether columns say what the expert points at, for training only
     pointing: bool = False
@@ -86,7 +86,7 @@ class Recording:
             raise ValueError(f"--env.perturbations={','.join(self.perturbations)} has a condition twice")
 
     def _of_scenes(self) -> None:
-        """Take the number of episodes from that of scenes; these are always labelled."""
+        """Set the number of episodes from that of scenes, which are always labelled."""
         if self.static < 1 or self.static % self.scenes:
             raise ValueError(f"--static={self.static} must be in 1..{SCENES} or a multiple of {SCENES}")
         for name, value in {"--relabel": self.relabel, f"--noise={self.noise}": self.noise}.items():
@@ -97,7 +97,7 @@ class Recording:
 
     @property
     def scenes(self) -> int:
-        """Seeds of an episode: scenes that are stored as one, for LeRobot takes its time for each; else 1."""
+        """Number of scenes stored as one episode, as LeRobot takes long for each; 1 without scenes."""
         return min(self.static, SCENES) or 1
 
     @property
@@ -124,12 +124,12 @@ class Recording:
 
     @property
     def conditions(self) -> list[EpisodeSpec]:
-        """The specs that every seed is run with, with the first seed."""
+        """Return the specs that every seed is run with; they hold the first seed."""
         tasks = [task for spec in self.suite_specs for task in specs_of_tasks(spec, self.task_ids)]
         return [replace(task, perturbations=text) for task in tasks for text in self.perturbations]
 
     def specs(self, num_tried: int) -> Iterator[EpisodeSpec]:
-        """The episodes to try after the first `num_tried`: seeds count up, each with all conditions."""
+        """Yield the episodes to try after the first `num_tried`: seeds count up, each with all conditions."""
         conditions = self.conditions
         for tried in itertools.count(num_tried):
             seeds_done, condition = divmod(tried, len(conditions))

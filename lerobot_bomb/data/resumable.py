@@ -1,8 +1,12 @@
 """A dataset that grows in blocks beside its final place: a kill costs little and leaves no half dataset.
 
-While it grows it is a folder, for a recording as follows: NAME.recording/recording.json the parameters
-NAME.recording/block-00000/ a finished LeRobotDataset, and block.json: what it holds The merged dataset
-appears under its name at once, complete. Lost or damaged blocks are made again (see ``kept_blocks.py``).
+While a recording grows, it is a folder:
+
+    NAME.recording/recording.json   the parameters
+    NAME.recording/block-00000/     a finished LeRobotDataset, and block.json: what it holds
+
+The merged dataset appears under its name at once, complete. Lost or damaged blocks are made again (see
+``kept_blocks.py``).
 """
 
 import os
@@ -90,11 +94,11 @@ def grow(
 
 @contextmanager
 def growing(parameters: Parameters, root: Path, folder: Path, parts: Sequence[Path] = ()) -> Iterator[None]:
-    """Hold a folder whose blocks are made in the meantime; finished ones are kept until `root` is there.
+    """Lock a folder while its blocks are made; finished blocks are kept until `root` is there.
 
     Raises:
-        ValueError: it cannot be written, or is in use.
-        RuntimeError: of an error in the meantime, with what is kept.
+        ValueError: the folder cannot be written, or is in use.
+        RuntimeError: an error occurred in the meantime; the message says what is kept.
     """
     try:
         lock = lock_folder(folder)
@@ -118,7 +122,7 @@ def growing(parameters: Parameters, root: Path, folder: Path, parts: Sequence[Pa
 
 
 def block_episodes(number: int) -> range:
-    """Return the episodes of a block: of a recording, the ones that it tries."""
+    """Return the numbers of a block's episodes; in a recording, of those that it tries."""
     return range(number * BLOCK_EPISODES, (number + 1) * BLOCK_EPISODES)
 
 
@@ -128,7 +132,7 @@ def num_blocks(num_episodes: int) -> int:
 
 
 def missing_blocks(folder: Path, numbers: range) -> list[range]:
-    """Return the numbers of those that a folder lacks; damaged blocks are deleted and named."""
+    """Return the numbers of blocks that a folder lacks; damaged blocks are deleted and named."""
     for block, damage in damaged_blocks(folder, numbers).items():
         tqdm.write(f"{block} {damage}; its episodes are made again", file=sys.stderr)
         remove([block])
@@ -176,7 +180,7 @@ def terminated_in_order() -> Iterator[None]:
 
 
 def check_repo_id(repo_id: str, flag: str = "--repo_id") -> None:
-    """Raise a ValueError unless it is USER/NAME as the Hub takes them."""
+    """Raise a ValueError unless a name is USER/NAME as the Hub takes them."""
     from huggingface_hub.errors import HFValidationError  # half a second, which no worker has
     from huggingface_hub.utils import validate_repo_id
 
@@ -219,7 +223,7 @@ def _num_episodes(block: Path) -> int:
 
 
 def _read_whole(dataset: Path) -> Progress:
-    """Return the progress that was made, once all of a dataset's files are known to hold it.
+    """Check that all files of a dataset are whole and hold its progress; return that.
 
     Raises:
         RuntimeError: names the file that is damaged, or what differs.

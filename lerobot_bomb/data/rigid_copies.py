@@ -16,7 +16,7 @@ MIRROR = np.array([[0.0, -1.0], [-1.0, 0.0]])  # across a diagonal
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """Takes a point x of a square board of `board_size` to `centre + shift + linear @ (x - centre)`."""
+    """Motion of a point x of a square board of `board_size` to `centre + shift + linear @ (x - centre)`."""
 
     board_size: float
     linear: np.ndarray  # (2, 2), orthogonal
@@ -33,12 +33,12 @@ class RigidMotion:
         return cls(board_size, linear @ MIRROR if is_mirrored else linear, shift)
 
     def points(self, positions: np.ndarray) -> np.ndarray:
-        """Positions (T, 2), moved; float32."""
+        """Move positions (T, 2); float32."""
         moved = (positions - self._centre) @ self.linear.T + self._centre + self.shift
         return moved.astype(np.float32)
 
     def images(self, images: np.ndarray) -> np.ndarray:
-        """Square images (T, S, S, 3) uint8 of the whole board, moved."""
+        """Move square images (T, S, S, 3) uint8 of the whole board."""
         pixels = images.shape[1] / self.board_size
         half = np.full(2, 0.5)  # the middle of the first pixel is half a pixel from the board's edge
         offset = (self._centre + self.shift - self.linear @ self._centre) * pixels + self.linear @ half - half

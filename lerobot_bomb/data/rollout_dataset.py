@@ -17,7 +17,7 @@ from lerobot_bomb.results.bomb import EpisodeResult
 
 
 def rollout_layout(recording: Recording) -> DatasetLayout:
-    """LeRobot's features under the environment's policy-side keys; never `environment_state`."""
+    """Return the layout, with the keys under which a policy sees BOMB; never `environment_state`."""
     size = recording.image_size
     dtype = "image" if recording.images else "video"
     image = {"dtype": dtype, "shape": (size, size, 3), "names": ["height", "width", "channels"]}
@@ -37,7 +37,7 @@ def rollout_layout(recording: Recording) -> DatasetLayout:
         ACTION: {"dtype": "float32", "shape": (len(action_names),), "names": list(action_names)},
         **geometry,
         **pointing,
-        # after which frames no action of the same episode follows: a scene belongs to no other
+        # True where no action of the same episode follows: a scene belongs to no other
         **({DONE: {"dtype": "bool", "shape": (1,), "names": None}} if recording.pointing else {}),
     }
     return DatasetLayout(

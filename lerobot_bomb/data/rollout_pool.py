@@ -43,7 +43,7 @@ class RolloutSettings:
     render_options: RenderOptions
     noise: float = 0.0  # standard deviation on x, y and z, in units of the largest relative step
     expert: Expert = expert_action
-    static: int = 0  # so many scenes instead of an episode
+    static: int = 0  # number of scenes instead of an episode; 0: an episode
     pointing: bool = False  # label what the expert points at
 
 
@@ -61,14 +61,14 @@ class Rollout:
 
     @property
     def num_steps(self) -> int:
-        """Frames that are stored."""
+        """Number of frames to store."""
         return len(self.instructions)
 
 
 def collect(
     env: gymnasium.Env, spec: EpisodeSpec, settings: RolloutSettings, agent: Agent | None = None
 ) -> Rollout:
-    """Run a spec's episode in an `env` of that spec, whatever the seed that the `env` was made with.
+    """Run a spec's episode in an `env` that was made for this spec, with any seed.
 
     The stored actions are the expert's clean ones, the executed ones carry the noise. With an ``agent``,
     which then acts, failed episodes are kept, too.
@@ -97,7 +97,7 @@ def collect(
 
 
 def collect_static(env: gymnasium.Env, spec: EpisodeSpec, settings: RolloutSettings) -> Rollout:
-    """Static scenes of a spec's episodes from its seed on, with the expert's actions.
+    """Return static scenes, one for each seed from the spec's on, with the expert's actions.
 
     The result is of the first one.
     """
@@ -223,7 +223,7 @@ class RolloutPool:
 
 
 def _work(settings: RolloutSettings, pipe: Connection) -> None:
-    """Run a worker: specs come, rollouts or an exception go, until the parent ends."""
+    """Run a worker: receive specs, send rollouts or an exception, until the parent ends."""
     worker = _Worker(settings)
     with suppress(EOFError, ConnectionError):
         while True:

@@ -111,7 +111,7 @@ def write_statistics(root: Path) -> None:
 
 
 def write_image_statistics(root: Path) -> None:
-    """Write image statistics of all episodes to stats.json, whatever the parts they came in.
+    """Write image statistics of all episodes to stats.json, however blocks held them.
 
     Raises:
         OSError, ValueError: a file is missing or damaged.
@@ -137,7 +137,7 @@ def write_image_statistics(root: Path) -> None:
 
 
 def _tolerance(exact: Statistics) -> np.ndarray:
-    """(D,) what LeRobot's histograms and float32 may be off by."""
+    """(D,) error that LeRobot's histograms and float32 may have."""
     size_D = np.maximum(np.abs(exact["min"]), np.abs(exact["max"]))
     return 1e-6 + 1e-5 * size_D + TOLERANCE * (exact["max"] - exact["min"])
 

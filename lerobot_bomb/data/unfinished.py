@@ -25,7 +25,7 @@ class Parameters(Protocol):
     kind: ClassVar[str]  # "recording": the noun of messages and the ending of the growing folder
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the values that its JSON reads back as; the keys are flags."""
+        """Return the values as JSON reads them back; the keys are flags."""
         ...
 
 
@@ -68,7 +68,7 @@ def check_folders(parameters: Parameters, root: Path, folder: Path, resume: bool
 
 
 def _check_new(kind: str, root: Path, folder: Path) -> None:
-    """Refuse what is in the way; to delete it is advised only where it is ours."""
+    """Refuse what is in the way; advise to delete it only if it is ours."""
     if root.exists():
         if not (root / METADATA_FILE).is_file():
             raise ValueError(f"--root={root} exists already; name a folder that does not exist yet")
@@ -90,7 +90,7 @@ def _check_new(kind: str, root: Path, folder: Path) -> None:
 
 
 def check_same(flag: str, parameters: Parameters, path: Path, where: Path) -> None:
-    """Raise a ValueError, for a flag, where the parameters in a file are others."""
+    """Raise a ValueError that names a flag if the parameters in a file differ."""
     kind = parameters.kind
     if not path.exists():
         if {other.name for other in path.parent.iterdir()} - {LOCK_FILE, path.with_suffix(".tmp").name}:
@@ -99,7 +99,7 @@ def check_same(flag: str, parameters: Parameters, path: Path, where: Path) -> No
     existing = read_json(path).get(kind)
     if existing is None:
         raise ValueError(f"{flag}: {path} is not of a {kind}")
-    # an earlier version wrote nothing of a flag that it had not: its default
+    # a flag that an earlier version lacked has its default
     of_existing = {
         name: existing.get(name, getattr(type(parameters), name, None)) for name in parameters.to_dict()
     }
@@ -136,7 +136,7 @@ def lock_folder(folder: Path) -> AbstractContextManager[object]:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Leave the finished blocks, the parameters, the lock, and files that are not ours."""
+    """Delete unfinished files; leave finished blocks, parameters, the lock, and files that are not ours."""
     ours = [path for path in folder.iterdir() if UNFINISHED.fullmatch(path.name)]
     remove([*ours, parameters_file(folder).with_suffix(".tmp")])
 

@@ -1,12 +1,12 @@
 """Decoding of numbers, several symbols a pass where they can be guessed.
 
 A pass reads the symbol chosen last and some that are guessed to follow it, and gives the likeliest choice
-after each. As far as the guesses are these choices they are right, and so is the first choice that differs
-from its guess: what is written is what one symbol a pass would write (speculative decoding, arXiv 2211.17192,
-for greedy choices). Rows get on differently far in a pass, and leave the batch when they are done.
+after each. Guesses are right up to the first that differs from its choice, and that choice is right, too. So
+a row gets the symbols that one a pass would write (speculative decoding, arXiv 2211.17192, for greedy
+choices). Rows advance by different numbers of symbols, and leave the batch when they are done.
 
 A sample is the likeliest choice after Gumbel noise was added to the logits (arXiv 1611.01144, section 2.1).
-The noise is that of a symbol's place in the answer, so guesses change no sample either.
+The noise belongs to a symbol's place in the answer, so guesses change no sample either.
 
 Shapes: `B` batch, `S` symbols, `N` numbers, `L` tokens of a prompt, `H` hidden size, `G` guesses,
 `K` = 1 + G.
@@ -24,20 +24,20 @@ from lerobot_bomb.decoding.grammar import NumberGrammar, Place
 from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.finite import require_finite_answers
 
-# (B, N) numbers that are complete, and where each row stands -> (B, G) guesses of what comes next, at most
+# (B, N) complete numbers and each row's place -> (B, G) guesses of the symbols that follow, at most
 # MAX_GUESSES
 Guess = Callable[[Tensor, Place], Tensor]
 
 MAX_GUESSES = 24
-# where wrong ones cost time: how many are asked for in the first pass, which also reads the prompt
+# guesses in the first pass, which also reads the prompt, where wrong ones cost time
 FIRST_GUESSES = 4
 
 
 class Continuation(Protocol):
-    """A model that goes on with rows of symbols."""
+    """A model that continues rows of symbols."""
 
     def __call__(self, symbol_BK: Tensor, first_B: Tensor) -> Tensor:
-        """(B, K) symbols, (B,) column of each row's first in its answer -> (B, K, S) logits after each."""
+        """(B, K) symbols, (B,) column of each row's first in the answer -> (B, K, S) logits after each."""
         ...
 
     def keep(self, row_B: Tensor) -> None:
@@ -69,7 +69,7 @@ class CachedContinuation(Continuation):
         length_B: Tensor,
         prompt: Prompt | None = None,
     ):
-        """``embed``: symbols -> (..., H); ``head``: (..., H) -> (..., S); ``length_B``: of the prompts."""
+        """``embed``: symbols -> (..., H); ``head``: (..., H) -> (..., S); ``length_B``: prompts' lengths."""
         self._text, self._embed, self._head = text, embed, head
         self._length_B, self._prompt = length_B, prompt
 
@@ -105,7 +105,7 @@ class Answers(NamedTuple):
 
     @classmethod
     def start(cls, grammar: NumberGrammar, batch_size: int, noise: Tensor | None = None) -> "Answers":
-        """Start with the space that every answer begins with, which is written."""
+        """Start answers after the space that each begins with."""
         place = grammar.start(batch_size)
         numbers_BN = place.prefix.new_zeros(batch_size, grammar.num_numbers)
         ones_B = torch.ones_like(place.prefix)
@@ -114,7 +114,7 @@ class Answers(NamedTuple):
         return cls(numbers_BN, SPACE * ones_B, ones_B, place.prefix, place.number, ones_B.bool(), noise)
 
     def noise_of(self, num_choices: int) -> Tensor:
-        """(B, K, S) the noise of the next K choices."""
+        """(B, K, S) noise of the next K choices."""
         column_K = torch.arange(num_choices, device=self.noise.device)
         index_BK = (self.num_symbols[:, None] + column_K).clamp(max=self.noise.shape[1] - 1)
         return self.noise.gather(1, index_BK[..., None].expand(-1, -1, self.noise.shape[2]))
@@ -154,7 +154,7 @@ def likeliest(logits: Tensor) -> tuple[Tensor, Tensor]:
 def write(
     model: Continuation, grammar: NumberGrammar, guess: Guess, answers: Answers, num_guesses: int
 ) -> tuple[Answers, Tensor]:
-    """One pass: further answers, and (B,) how many guesses were right."""
+    """Run a pass; return the longer answers, and (B,) how many guesses were right."""
     place = answers.place
     guess_BG = guess(answers.numbers, place)[:, :num_guesses]
     logits_BKS = model(torch.cat([answers.last[:, None], guess_BG], dim=1), answers.num_symbols - 1)
@@ -189,7 +189,7 @@ def decode_numbers(
     stop_after: int,
     noise: Tensor | None = None,
 ) -> Decoded:
-    """The first ``stop_after`` numbers of each row: the likeliest, or with ``noise`` (B, A, S) sampled ones.
+    """Decode the first ``stop_after`` numbers of each row: likeliest or, with ``noise`` (B, A, S), samples.
 
     Only what the grammar allows is ever chosen, so every row is well-formed by construction. What a row
     writes after it is done is ignored.

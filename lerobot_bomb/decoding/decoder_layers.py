@@ -39,9 +39,9 @@ class TextLayers:
     """A text model's layers and its last norm, with its weights or with a copy of them."""
 
     def __init__(self, model: Any, *, copy_dtype: torch.dtype | None = None, compiled: bool = False):
-        """``copy_dtype``: of a copy's products, which stays where it is, whatever becomes of the model.
+        """``copy_dtype``: copy the weights, for products in this type; the copy does not move with the model.
 
-        ``compiled``: by `torch.compile`, which fuses what is not a product.
+        ``compiled``: use `torch.compile`, which fuses what is not a product.
         """
         self.model, self.config = model, model.config
         self.embedding: Tensor = model.embed_tokens.weight
@@ -74,9 +74,9 @@ class TextLayers:
     def __call__(self, x_BKH: Tensor, columns: Columns, caches: Sequence[Tensor]) -> Tensor:
         """(B, K, H) embeddings -> (B, K, H) states after the last layer.
 
-        ``caches``: of each layer (Z, 2, C, E), keys before values; what is new comes into them.
+        ``caches``: of each layer (Z, 2, C, E), keys before values; new ones are written into it.
         """
-        # one row a token: fewer dimensions to get ready for in each of many small operations
+        # one row per token: fewer dimensions to set up in each of many small operations
         x_NH = x_BKH.flatten(0, 1)
         for layer, cache_Z2CE in zip(self._layers, caches, strict=True):
             x_NH = self._run(layer, x_NH, columns, cache_Z2CE)
@@ -88,7 +88,7 @@ class TextLayers:
 
     @torch.no_grad()
     def refresh(self) -> None:
-        """Give a copy the weights that the model has now."""
+        """Update the copy, if any, to the model's current weights."""
         copies = [copied for copied, _, _ in self._copied]
         weights = [getattr(module, name) for _, module, name in self._copied]
         torch._foreach_copy_(copies, weights)  # pyright: ignore[reportPrivateImportUsage]
@@ -97,7 +97,7 @@ class TextLayers:
 
 
 def _rope_scale(attention: Any) -> float:
-    """Return the factor of rotary positions with which rotated queries and keys give ``p`` of `_Layer._read`.
+    """Return the scale of rotary positions that makes products of queries and keys ``p`` of `_Layer._read`.
 
     Scaling the tables costs nothing; scaling the products costs an operation in every layer and pass.
     """
@@ -114,7 +114,7 @@ def _copy(module: nn.Module, dtype: torch.dtype) -> nn.Module:
 
 
 def _same_parameters(copied: nn.Module, source: nn.Module) -> list[tuple[Tensor, nn.Module, str]]:
-    """Parameters of a copy, and where each is a copy of."""
+    """Return each parameter of a copy, with the module and the name of its source."""
     return [
         (parameter, part, name)
         for copied_part, part in zip(copied.modules(), source.modules(), strict=True)
@@ -146,7 +146,7 @@ class _Layer:
         return [norm for norm in norms if norm is not None]
 
     def __call__(self, x_NH: Tensor, columns: Columns, cache_Z2CE: Tensor) -> Tensor:
-        """(N, H) -> (N, H)."""
+        """States (N, H) -> states (N, H) after the layer."""
         read_NH = self._attend(self._before_attention(x_NH), columns, cache_Z2CE)
         x_NH = _add(x_NH, read_NH, self._after_attention)
         return _add(x_NH, self._mix(self._before_mlp(x_NH)), self._after_mlp)
@@ -155,14 +155,14 @@ class _Layer:
         query, new = self._heads(x_NH, columns.rope)
         dtype = cache_Z2CE.dtype
         cache_Z2CE.view(-1, new.shape[-1]).index_put_((columns.slots,), cast(new, dtype))
-        # the queries that share a key stand beside each other: one product a key-value head
+        # queries that share a key are adjacent: one product per key-value head
         query_BVKGE = cast(query, dtype).view(columns.shape).transpose(1, 2)
         keys_ZCE, values_ZCE = cache_Z2CE.narrow(2, 0, columns.bias.shape[-1]).unbind(dim=1)
         read = self._read(query_BVKGE, keys_ZCE, values_ZCE, columns.bias)
         return self._out(read.view(query_BVKGE.shape).transpose(1, 2).reshape(len(x_NH), -1))
 
     def _read(self, query_BVKGE: Tensor, keys_ZCE: Tensor, values_ZCE: Tensor, bias_B1XC: Tensor) -> Tensor:
-        """Return what queries read, as many numbers as they have."""
+        """Return the values that queries read, as many numbers as the queries have."""
         batch_size, num_keys, *_, size = query_BVKGE.shape
         if self._softcap is None:
             keys_BVCE = keys_ZCE.view(batch_size, num_keys, -1, size)
@@ -170,8 +170,8 @@ class _Layer:
             return scaled_dot_product_attention(
                 query_BVKGE.flatten(2, 3), keys_BVCE, values_BVCE, attn_mask=bias_B1XC, scale=self._scale
             )
-        # of p = 2 * scale * product / softcap, softcap * tanh(p / 2) is 2 * softcap * sigmoid(p) but for a
-        # constant, which softmax does not see; the sigmoid is faster
+        # for p = 2 * scale * product / softcap, softcap * tanh(p / 2) is 2 * softcap * sigmoid(p) but for a
+        # constant, which softmax ignores; the sigmoid is faster
         products_ZXC = torch.bmm(query_BVKGE.reshape(len(keys_ZCE), -1, size), keys_ZCE.transpose(1, 2))
         capped_ZXC = cast(products_ZXC, torch.float32).sigmoid_()
         capped_BVXC = capped_ZXC.view(batch_size, num_keys, *capped_ZXC.shape[1:])
@@ -186,15 +186,15 @@ class _Layer:
 
 
 def _compile_layer() -> Callable[[_Layer, Tensor, Columns, Tensor], Tensor]:
-    """One piece of code for all layers, which differ only in their tensors; another for each size of pass."""
+    """Compile one function for all layers, which differ only in tensors; again for each size of pass."""
     torch._dynamo.config.recompile_limit = max(torch._dynamo.config.recompile_limit, MAX_COMPILED)
     return torch.compile(_Layer.__call__, dynamic=False)
 
 
 class _RMSNorm:
-    """A model's norm; what its weight alone decides is computed once.
+    """RMSNorm of a model; what depends on its weight alone is computed once.
 
-    On a CPU torch's own takes three times as long as the same in four operations.
+    On a CPU torch's own norm takes three times as long as the same in four operations.
     """
 
     def __init__(self, norm: Any):
@@ -212,7 +212,7 @@ class _RMSNorm:
             torch.add(self._source, 1, out=self._weight)
 
     def __call__(self, x: Tensor) -> Tensor:
-        """(..., H) -> (..., H)."""
+        """States (..., H) -> normalised states (..., H)."""
         if self.is_on_host and x.dtype == torch.float32:
             return self.unscaled(x).mul_(self.scale)
         if self._is_gemma:
@@ -225,7 +225,7 @@ class _RMSNorm:
 
 
 def _add(x: Tensor, new: Tensor, norm: _RMSNorm | None) -> Tensor:
-    """Add to x what a part of a layer adds to it, of the same shape."""
+    """Add the output of a layer's part, of the same shape, to x; normalise it first if there is a norm."""
     if norm is None:
         return x + new
     if norm.is_on_host and x.dtype == new.dtype == torch.float32:

@@ -13,13 +13,13 @@ from lerobot_bomb.decoding.grammar import NumberGrammar, Place
 
 
 class KnownSymbols:
-    """The space or the end, which is right wherever a number cannot go on."""
+    """Draft of one space or end, which is right wherever a number cannot go on."""
 
     def __init__(self, grammar: NumberGrammar):
         self._grammar = grammar
 
     def __call__(self, _: Tensor, place: Place) -> Tensor:
-        """(B, G), without any guess where the host sees that no row's number has to end."""
+        """(B, 1) guesses; (B, 0) if the host sees that no row's number has to end."""
         must_end_B = self._grammar.must_end[place.prefix]
         if not must_end_B.is_cuda and not bool(must_end_B.any()):
             return place.prefix.new_empty(len(place.prefix), 0)
@@ -27,7 +27,7 @@ class KnownSymbols:
 
 
 class LinearDraft:
-    """Draft in which every action dimension goes on as it went in the last two steps of the answer."""
+    """Draft that continues every action dimension on the line through the last two steps of the answer."""
 
     def __init__(self, grammar: NumberGrammar, num_dims: int, num_before: int = 0):
         """``num_before``: numbers of the answer that precede its actions and follow no line."""
@@ -44,7 +44,7 @@ class LinearDraft:
         numbers = torch.cat([begun_B1, next_BW], dim=1)
         mask_BWC = grammar.is_spelled[numbers]
         mask_BWC[:, 1:] &= (first_B1 + 1 + ahead_W < grammar.num_numbers)[..., None]
-        # the space and the digits that stand are no guesses
+        # the space and the digits that are written are no guesses
         start_B1 = 1 + grammar.num_digits[place.prefix][:, None]
         columns_BG = start_B1 + torch.arange(MAX_GUESSES, device=number_BN.device)
         return self._spell(grammar.spelling[numbers].flatten(1), mask_BWC.flatten(1)).gather(1, columns_BG)
@@ -57,9 +57,9 @@ class LinearDraft:
         return spelled.scatter(1, column_BM, symbol_BM)
 
     def _complete(self, number_BN: Tensor, place: Place) -> Tensor:
-        """(B,) the number that is being written, as near to what is expected as its beginning allows.
+        """(B,) the number that is being written, as near to the expected one as its beginning allows.
 
-        Of numbers without zero padding, those with as many digits as expected come into question.
+        Without zero padding, only numbers with as many digits as expected are considered.
         """
         grammar = self._grammar
         expected_B = self._expect(number_BN, place.number[:, None], 0).squeeze(1)
@@ -74,7 +74,7 @@ class LinearDraft:
     def _expect(self, number_BN: Tensor, index_BX: Tensor, steps: Tensor | int) -> Tensor:
         """(B, X) the number ``steps`` after an unknown one, on the line through the two steps before that.
 
-        In the first step, and before: the middle of the range, then no slope.
+        Without a step before, the middle of the range; without two, no slope.
         """
         middle = (self._grammar.num_values - 1) // 2
         last_BX, before_BX = (

@@ -21,7 +21,7 @@ class Place:
     number: Tensor  # which number they belong to, from 0
 
     def at(self, index_B: Tensor) -> "Place":
-        """(B, K) places -> (B,) that of one column in each row."""
+        """(B, K) places -> (B,) places, of one column in each row."""
         index_B1 = index_B[:, None]
         return Place(self.prefix.gather(1, index_B1)[:, 0], self.number.gather(1, index_B1)[:, 0])
 
@@ -67,7 +67,7 @@ class NumberGrammar(nn.Module):
         allowed = torch.stack([next_state != self.DONE] * 2)
         allowed[1, :, SPACE] = False
         allowed[1, :, END] = is_number
-        allowed[:, self.DONE, END] = True  # rows that are done go on saying so
+        allowed[:, self.DONE, END] = True  # rows that are done repeat the end
         bias = torch.zeros(allowed.shape).masked_fill(~allowed, -torch.inf)
         values_V1 = torch.arange(num_values)[:, None]
         spelling, is_spelled = number_symbols(values_V1, self.width, zero_padded=fixed_width > 0)
@@ -106,7 +106,7 @@ class NumberGrammar(nn.Module):
         return Place(prefix_B, torch.zeros_like(prefix_B))
 
     def advance(self, place: Place, symbol: Tensor) -> Place:
-        """One symbol further."""
+        """Return the place after one more symbol."""
         return Place(self.next_state[place.prefix, symbol], place.number + (symbol == SPACE))
 
     def walk(self, place: Place, symbol_BG: Tensor) -> Place:
@@ -122,5 +122,5 @@ class NumberGrammar(nn.Module):
         return place.number == self.num_numbers - 1
 
     def logit_bias(self, place: Place) -> Tensor:
-        """(..., S): 0 for what may follow, -inf for what may not."""
+        """(..., S) float32: 0 for symbols that may follow, -inf for others."""
         return self.bias[self.is_last(place).long(), place.prefix]

@@ -11,13 +11,13 @@ from lerobot_bomb.decoding.kv_cache import CachedText, Positions, same_positions
 
 
 class GraphCache[T]:
-    """Cache of what is made for each size of batch and prompt, on a copy of a text model's weights.
+    """Cache of one object for each size of batch and prompt, on a copy of a text model's weights.
 
-    There is one copy for each device and type that is computed in. A copied or pickled cache is empty.
+    There is one copy for each device and type of the computation. A copied or pickled cache is empty.
     """
 
     def __init__(self, text_model: Any, positions: Positions = same_positions, *, compiled: bool = False):
-        """``compiled``: layers by `torch.compile`, which fuses what is not a product."""
+        """``compiled``: use `torch.compile` for layers, which fuses what is not a product."""
         self._text_model, self._positions, self._compiled = text_model, positions, compiled
         self._forget()
 
@@ -30,7 +30,7 @@ class GraphCache[T]:
         self._made: dict[Any, T] = {}
 
     def find(self, prompt_BLH: Tensor, num_new: int, make: Callable[[CachedText], T]) -> T:
-        """Return what was made for such prompts and so many new tokens, with the model's current weights."""
+        """Return the object for such prompts and so many new tokens, with the model's current weights."""
         modules = list(self._text_model.modules())
         if modules != self._modules:  # such as an adapter that was added
             self._forget()

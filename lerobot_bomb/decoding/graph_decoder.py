@@ -27,7 +27,7 @@ NUM_GUESSES = 16  # of every pass
 
 
 class GraphDecoder:
-    """Answers to prompts of one shape.
+    """Decoder of answers to prompts of one shape.
 
     Rows that are done go on until all are: a smaller batch would have to be captured, too.
     """
@@ -50,7 +50,7 @@ class GraphDecoder:
         stop_after: int,
         noise: Tensor | None = None,
     ) -> Decoded:
-        """Decode as `decode_numbers`, with the rows as they are now."""
+        """Decode as `decode_numbers`, with the current rows of embedding and head."""
         self._embeds_SH.copy_(embeds_SH)
         self._head_SH.copy_(head_SH)
         return decode_ahead(self._passes(prompt, noise), self._grammar, stop_after)
@@ -80,7 +80,7 @@ class GraphDecoder:
 
 
 def decode_ahead(passes: Iterator[Answers], grammar: NumberGrammar, stop_after: int) -> Decoded:
-    """Decode as `decode_numbers`; during a pass the host hears if the last left all rows done, and finite."""
+    """Decode as `decode_numbers`; in a pass the host learns if the last left all rows done, and finite."""
     hear = None
     for num_passes, answers in enumerate(passes, 1):
         if hear is not None:
@@ -94,7 +94,7 @@ def decode_ahead(passes: Iterator[Answers], grammar: NumberGrammar, stop_after: 
 
 
 def _fetch(flags: Tensor) -> Callable[[], list[bool]]:
-    """Ask a device for values; the answer is waited for when it is called."""
+    """Start to copy flags from a device; return a function that waits for them."""
     copied = flags.to("cpu", non_blocking=True)
     if not flags.is_cuda:
         return copied.tolist

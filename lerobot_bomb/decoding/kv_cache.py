@@ -44,9 +44,8 @@ def check_positions(
 class CachedText:
     """Text model that returns hidden states of new tokens, which attend to cached ones.
 
-    A token's column in the cache says its position, the same in every row (``positions``). One at a column
-    that is written already takes its place, so what is no longer wanted is written over. Gaps go to
-    `unread_column`.
+    A token's column in the cache sets its position, the same in every row (``positions``). A token at a
+    column that is already written replaces what is there. Gaps go to `unread_column`.
 
     Raises:
         ValueError: the model has fewer positions than ``num_columns``.
@@ -64,7 +63,7 @@ class CachedText:
         self._num_heads = config.num_key_value_heads
         self._num_groups = config.num_attention_heads // self._num_heads
         self._layers = layers
-        # a multiple of 8, which attention on CUDA wants of its masks
+        # a multiple of 8, which attention on CUDA requires of its masks
         self._columns_C = torch.arange(-(-(num_columns + 1) // 8) * 8, device=embedding.device)
         self.unread_column = len(self._columns_C) - 1
         self._rope = layers.rope(positions(self._columns_C))
@@ -92,7 +91,7 @@ class CachedText:
         return self.read(embeds_BKH, columns)
 
     def read(self, embeds_BKH: Tensor, columns: Columns) -> Tensor:
-        """Read as a call does, tokens at columns that `singly` located."""
+        """Compute as a call does, for tokens at columns that `singly` located."""
         return self._layers(embeds_BKH, columns, self._layer_caches)
 
     def singly(self, columns_BK: Tensor) -> list[Columns]:
@@ -110,11 +109,11 @@ class CachedText:
         return [Columns(shape, slots, rope, bias[..., :count]) for slots, rope, bias, count in parts]
 
     def columns_of(self, mask_BL: Tensor) -> Tensor:
-        """Return the cache column (B, L) of each token that the mask holds; padding goes out of the way."""
+        """Return the cache column (B, L) of each token in the mask; padding goes to `unread_column`."""
         return (mask_BL.cumsum(dim=1) - 1).masked_fill(~mask_BL, self.unread_column)
 
     def hide(self, columns_BK: Tensor, hidden_BK: Tensor) -> None:
-        """Let no other token read those at these columns that are hidden; gaps cannot be."""
+        """Let no other token read the hidden ones of these columns; gaps cannot be hidden."""
         self._hides = True
         self._hidden_BC.scatter_(1, columns_BK, hidden_BK & (columns_BK != self.unread_column))
 
@@ -147,7 +146,7 @@ class CachedText:
         )
 
     def _counts_of_columns(self, columns_BK: Tensor) -> list[int]:
-        """Return how many columns attention reads for each token; all where the host would have to wait."""
+        """Return how many columns attention reads for each token; all if the host would have to wait."""
         if columns_BK.is_cuda:
             return [len(self._columns_C)] * columns_BK.shape[1]
         return [last + 1 for last in (columns_BK % self.unread_column).amax(dim=0).tolist()]

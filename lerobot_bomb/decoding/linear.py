@@ -1,4 +1,4 @@
-"""Projections of tokens, called many times on few of them."""
+"""Projections that are called many times, on few tokens."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -11,7 +11,7 @@ Linears = Callable[[Tensor], list[Tensor]]
 
 
 def make_linears(modules: Sequence[nn.Module], *, are_copies: bool) -> Linears:
-    """Projections of the same input; plain copies are a single one, their weights move beside each other."""
+    """Join projections of one input in a function; plain copies become one product of adjacent weights."""
     linears = [module for module in modules if is_plain(module)]
     if not are_copies or len(linears) < len(modules):
         products = [make_linear(module) for module in modules]
@@ -26,12 +26,12 @@ def make_linears(modules: Sequence[nn.Module], *, are_copies: bool) -> Linears:
 
 
 def make_linear(module: nn.Module) -> Callable[[Tensor], Tensor]:
-    """A projection; a plain one without `Module.__call__`, which is half of a small product's time."""
+    """Return a projection; a plain one skips `Module.__call__`, which is half of a small product's time."""
     return multiply(*module.parameters()) if is_plain(module) else module
 
 
 def multiply(weight: Tensor, bias: Tensor | None = None) -> Callable[[Tensor], Tensor]:
-    """(N, H) -> (N, O) by (O, H)."""
+    """Return the product with a weight (O, H), a function (N, H) -> (N, O)."""
     transposed = weight.detach().t()
     return partial(torch.mm, mat2=transposed) if bias is None else partial(torch.addmm, bias, mat2=transposed)
 
@@ -42,5 +42,5 @@ def is_plain(module: nn.Module) -> TypeGuard[nn.Linear]:
 
 
 def cast(x: Tensor, dtype: torch.dtype) -> Tensor:
-    """`Tensor.to`, which takes as long as a small product even where there is nothing to do."""
+    """Convert as `Tensor.to`, which takes as long as a small product even with nothing to do."""
     return x if x.dtype == dtype else x.to(dtype)

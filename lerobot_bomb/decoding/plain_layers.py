@@ -1,4 +1,4 @@
-"""The layers of the Llama, Qwen 2 and Gemma 2 families as their equations say them.
+"""The layers of the Llama, Qwen 2 and Gemma 2 families as in their equations.
 
 Nothing is cached, joined, copied or computed in place. Slow; tests compare the fast ones, `decoder_layers`,
 with these, and these with transformers' own.
@@ -28,7 +28,7 @@ def hidden_states(model: Any, x_BLH: Tensor, position_L: Tensor) -> Tensor:
 
 
 def layer_states(layer: Any, x_BLH: Tensor, cos_LE: Tensor, sin_LE: Tensor) -> Tensor:
-    """One layer: attention, then the MLP, each on normalised states and added to them.
+    """Compute one layer: attention, then the MLP, each on normalised states and added to them.
 
     Gemma 2 normalises what is added, too.
     """
@@ -67,7 +67,7 @@ def rope(x: Tensor, cos_LE: Tensor, sin_LE: Tensor) -> Tensor:
 
 
 def softcap(attention: Any, logits: Tensor) -> Tensor:
-    """Attention logits, in Gemma 2 within a limit (arXiv:2408.00118, section 2)."""
+    """Limit attention logits, in Gemma 2 only (arXiv:2408.00118, section 2)."""
     limit = softcap_of(attention)
     return logits if limit is None else limit * torch.tanh(logits / limit)
 
@@ -78,7 +78,7 @@ def mlp(module: Any, x_BLH: Tensor) -> Tensor:
 
 
 def rms_norm(norm: Any, x: Tensor) -> Tensor:
-    """(..., H) of root mean square 1, times a weight; Gemma's counts from 1."""
+    """(..., H) of root mean square 1, times a weight; Gemma stores the weight minus 1."""
     is_gemma = isinstance(norm, Gemma2RMSNorm)
     weight = 1 + norm.weight if is_gemma else norm.weight
     eps = norm.eps if is_gemma else norm.variance_epsilon

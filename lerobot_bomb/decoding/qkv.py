@@ -20,8 +20,8 @@ Heads = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 def rotary_tables(model: Any, position_C: Tensor) -> tuple[Tensor, Tensor]:
     """Positions (C,), or (A, C) -> cosines and sines (C, E), as a text model turns its heads.
 
-    Every number of a head turns with one axis (M-RoPE, arXiv 2409.12191, section 2.1); text stands at the
-    same place of all three.
+    Every number of a head turns with one axis (M-RoPE, arXiv 2409.12191, section 2.1); text has the
+    same position on all three.
     """
     weight = model.embed_tokens.weight
     sections = model.config.rope_parameters.get("mrope_section")
@@ -64,12 +64,12 @@ class RopeHalves:
 class RopePairs:
     """Heads of plain projections on a CPU, where this is faster.
 
-    Weights are copied. Their rows stand so that numbers which are rotated together, the parts of a complex
-    one, are neighbours. Attention logits do not depend on their order.
+    Weights are copied. Their rows are ordered so that numbers which are rotated together, the parts of a
+    complex one, are neighbours. Attention logits do not depend on their order.
     """
 
     def __init__(self, attention: Any):
-        # small beside a model's other weights: copying them costs less than it brings
+        # small beside a model's other weights: copying them costs less than it saves
         self._size, self._num_keys = attention.head_dim, attention.config.num_key_value_heads
         queries, keys, values = ([*part.parameters()] for part in _projections(attention))
         self._query = multiply(*(self._beside(part) for part in queries))
@@ -77,7 +77,7 @@ class RopePairs:
         self._new = multiply(*(torch.cat([self._beside(key), value.detach()]) for key, value in keys_values))
 
     def _beside(self, part: Tensor) -> Tensor:
-        """Rows of weights or biases, those of a head's first half beside those of the second."""
+        """Interleave rows of weights or biases: those of a head's first half with those of the second."""
         return part.detach().unflatten(0, (-1, 2, self._size // 2)).transpose(1, 2).flatten(0, 2)
 
     def __call__(self, x_NH: Tensor, rope_N1E: Tensor) -> tuple[Tensor, Tensor]:

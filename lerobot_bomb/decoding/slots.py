@@ -1,7 +1,7 @@
-"""Decoding of answers with one choice a slot, one pass of the model each, or less.
+"""Decoding of answers with one choice per slot, in one pass of the model each, or fewer.
 
-An answer has steps of the same slots, and may have others ahead of them. The choices of a slot do not depend
-on those before it, so no automaton is needed: the output head has only the slot's rows.
+An answer has steps of the same slots, and may have others ahead of them. Which choices a slot allows does not
+depend on those before it, so no automaton is needed: the output head has only the slot's rows.
 
 Shapes: `B` batch, `L` tokens of a prompt, `H` hidden size, `T` steps of an answer, `G` slots of a step, `S`
 of an answer, `C` choices of all kinds of slots, `K` tokens of a pass.
@@ -28,10 +28,10 @@ from lerobot_bomb.vlm.backbone import exact_linear, in_float32
 
 
 class SlotDecoder:
-    """Choices after prompts; on CUDA captured whole for every shape of prompts that it has met.
+    """Decoder of choices after prompts; on CUDA captured whole for every shape of prompts.
 
     The prompt may have padding, but not in its last column. ``bidirectional_prompt``: every token
-    of the prompt attends to all of it, not only to what stands before.
+    of the prompt attends to all of it, not only to the tokens before.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class SlotDecoder:
         drafted: bool = False,
         compiled: bool = False,
     ):
-        """``cap``: of logits; ``drafted``: guess that a step is as the one before, on a CPU, one row."""
+        """``cap``: limits logits; ``drafted``: on a CPU, for one row, guess that a step repeats the last."""
         self._text_model, self._positions, self._cap = text_model, positions, cap
         self._bidirectional_prompt, self.drafted = bidirectional_prompt, drafted
         self.num_passes: int | None = None  # of the last answers, the prompt's included
@@ -63,8 +63,8 @@ class SlotDecoder:
     ) -> Tensor:
         """(B, S) the likeliest choice in every slot, given those before it, or with ``noise`` a sampled one.
 
-        ``slots``: of a step, which of the choices come into question, counted from the first of them;
-        ``ahead``: the same of what is chosen once, before the steps; its noise is that of the first one;
+        ``slots``: the choices that each slot of a step allows; results count from the first of them;
+        ``ahead``: the same for slots chosen once, before the steps, with the noise of the first step;
         ``embeds_CH`` and ``head_CH``: the choices' rows of the embedding and of the output head; ``noise``
         (B, T, C): added to the choices' logits.
 
@@ -87,7 +87,7 @@ class SlotDecoder:
         layers = TextLayers(self._text_model)
         text = CachedText(layers, batch_size, num_columns + num_slots, self._positions)
         head = SlotHead(head_CH, noise, self._cap)
-        # rows that agree on how far guesses are right are rare
+        # several rows seldom agree on how many guesses are right
         is_drafted = self.drafted and batch_size == 1
         singly = places[: len(ahead) + len(slots)] if is_drafted else places
         choices_BS, finite_B = choose(
@@ -133,7 +133,7 @@ class SlotHead:
 
 
 class GraphSlots:
-    """Choices after prompts of one shape."""
+    """Decoder of choices after prompts of one shape."""
 
     def __init__(
         self,
@@ -171,7 +171,7 @@ class GraphSlots:
 
 
 def _places(ahead: Sequence[slice], slots: Sequence[slice], num_steps: int) -> list[tuple[int, slice]]:
-    """The step and the slot of every choice of an answer."""
+    """Return the step and the slot of every choice of an answer."""
     return [(0, slot) for slot in ahead] + [(step, slot) for step in range(num_steps) for slot in slots]
 
 
@@ -184,7 +184,7 @@ def choose(
     *,
     bidirectional_prompt: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Choose as `SlotDecoder`, on an empty cache; and (B,) bool: were all choices from finite logits?"""
+    """Choose as `SlotDecoder`, on an empty cache; also return (B,) bool, all logits were finite."""
     last_B1 = prompt.mask.sum(dim=1, keepdim=True) - 1
     columns_BL = text.columns_of(prompt.mask)
     if prompt.hidden is not None:
@@ -210,12 +210,12 @@ def repeat(
     embeds_CH: Tensor,
     head: SlotHead,
 ) -> tuple[Tensor, int]:
-    """(1, S) the same as one choice a pass, after a prompt of this length; and the passes.
+    """Choose several a pass, after a prompt of this length: (1, S), as one a pass would, and the passes.
 
-    ``first_1S``: what is chosen up to the end of the first step, which has ``num_kinds`` slots.
+    ``first_1S``: choices up to the end of the first step, which has ``num_kinds`` slots.
 
-    A pass reads the choice made last and guesses that go on as the step before. As far as guesses are the
-    likeliest choices they are right, and so is the first choice that differs from its guess.
+    A pass reads the last choice and guesses that repeat the step before. Guesses are right up to the first
+    that differs from the likeliest choice, and that choice is right, too.
     """
     chosen: list[int] = first_1S[0].tolist()
     num_tokens, num_passes = 1, 0

@@ -18,7 +18,7 @@ from lerobot_bomb.vlm.backbone import Backbone
 
 
 class NumberWriter:
-    """Numbers after prompts; on CUDA with the captured passes of every shape of prompts that it has met."""
+    """Writer of numbers after prompts; on CUDA, passes are captured for every shape of prompts."""
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class NumberWriter:
     def __call__(
         self, prompt: Prompt, symbol_ids: Tensor, stop_after: int, noise: Tensor | None = None
     ) -> Decoded:
-        """The first ``stop_after`` numbers of each row; ``noise`` as `decode_numbers` takes it."""
+        """Write the first ``stop_after`` numbers of each row; ``noise`` as in `decode_numbers`."""
         max_symbols = self._grammar.max_symbols(stop_after)
         head = self._backbone.vlm.lm_head
         if prompt.embeds.is_cuda and type(head) is nn.Linear:

@@ -1,1 +1,1 @@
-"""Parts that all our environments share; light, as simulator processes import it."""
+"""Parts that all our environments share; quick to import, for simulator processes."""

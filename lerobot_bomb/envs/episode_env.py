@@ -27,7 +27,7 @@ type Transition = tuple[Observation, float, bool, bool, dict[str, Any]]
 class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, np.ndarray], ABC):
     """Episodes that a frozen spec and a seed determine.
 
-    The seed is the reset's, whatever the spec's. Once an episode has ended, `step` changes nothing until
+    The seed is that of `reset`, whatever the spec's. Once an episode has ended, `step` changes nothing until
     `reset`, and its reward is 0.
     """
 
@@ -42,10 +42,10 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, n
         self.task_description = ""
         self._spec = spec
         self._results_path = results_path
-        # of the episode, told by a vector environment
+        # evaluation of the episode, set by a vector environment
         self.evaluation: Evaluation | None = None
         self.is_counted = True  # else it leaves no record
-        self._current_run: RunT | None = None  # what exists once an episode has been started
+        self._current_run: RunT | None = None  # set once an episode has been started
         self._seed: int = spec.seed  # of the episode
         self._steps = 0
         self._last_transition: Transition | None = None
@@ -55,7 +55,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, n
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode: of `seed`, else of one that `np_random` draws.
+        """Start the episode of `seed`, or of a seed that `np_random` draws.
 
         `options` has no effect; vector environments pass theirs on.
         """
@@ -83,7 +83,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, n
         return observation, reward, terminated, truncated, info
 
     def add_query(self, query: Query) -> None:
-        """Note that the policy is to give the next action; without effect once the episode has ended."""
+        """Add a query of the policy for the next action; without effect once the episode has ended."""
         if self._last_transition is None:
             self._queries.append(query)
 
@@ -134,7 +134,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, n
 
     @abstractmethod
     def _begin(self, spec: SpecT) -> tuple[Observation, dict[str, Any]]:
-        """Start the spec's episode as `_current_run`; its first observation and info."""
+        """Start the spec's episode as `_current_run`; return its first observation and info."""
 
     def _check(self, action: np.ndarray) -> np.ndarray:
         """Return a copy of an action (D,) as floats; raise a ValueError if it is no action."""
@@ -155,7 +155,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, n
 
     @abstractmethod
     def _draw_for_people(self, run: RunT) -> np.ndarray:
-        """(H, W, 3) uint8."""
+        """(H, W, 3) uint8 image for people."""
 
     @abstractmethod
     def _result(self, run: RunT) -> ResultT:

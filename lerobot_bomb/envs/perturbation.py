@@ -18,7 +18,7 @@ from lerobot_bomb.envs.photometric import Photometric
 class EpisodeTransform(ABC):
     """Effect of one axis on an episode; a method that it does not override leaves things as they are.
 
-    The level sets how far it goes, the random generator only where to, so that the same seed at a higher
+    The level sets how far it goes, the random generator only in which direction, so the same seed at a higher
     level goes further the same way. An environment's own base adds what its axes change in the simulator.
     """
 
@@ -28,11 +28,11 @@ class EpisodeTransform(ABC):
         """Draw the effect of a level of 1..5; `nominal` is the episode without perturbations."""
 
     def reword(self, instruction: str, nominal: Any) -> str:
-        """The instruction after the change; it means the same."""
+        """Return the instruction after the change, which means the same."""
         return instruction
 
     def sense(self, rgb: np.ndarray, number: int) -> np.ndarray:
-        """(H, W, 3) uint8 -> the same, the `number`-th image of the episode after the change."""
+        """(H, W, 3) uint8, the `number`-th image of the episode -> the image after the change."""
         return rgb
 
 
@@ -73,7 +73,7 @@ class EpisodePerturbation[T: EpisodeTransform]:
 
     @classmethod
     def draw(cls, condition: AxisCondition, seed: int, nominal: Any) -> Self:
-        """The axes of a condition, each drawn from a generator of its own."""
+        """Draw the axes of a condition, each from a generator of its own."""
         kinds = transforms_of(condition)
 
         def rng(stream: Stream, axis: str) -> np.random.Generator:
@@ -90,17 +90,17 @@ class EpisodePerturbation[T: EpisodeTransform]:
         return cls(levels, drawn)
 
     def of[K: EpisodeTransform](self, kind: type[K]) -> K | None:
-        """The transform of a kind; None where its axis is off."""
+        """Return the transform of a kind; None if its axis is off."""
         return next((each for each in self.transforms.values() if isinstance(each, kind)), None)
 
     def reword(self, instruction: str, nominal: Any) -> str:
-        """The instruction after all changes."""
+        """Return the instruction after all changes."""
         for each in self.transforms.values():
             instruction = each.reword(instruction, nominal)
         return instruction
 
     def sense(self, rgb: np.ndarray, number: int) -> np.ndarray:
-        """(H, W, 3) uint8 -> the same, the `number`-th image of the episode after all changes."""
+        """(H, W, 3) uint8, the `number`-th image of the episode -> the image after all changes."""
         for each in self.transforms.values():
             rgb = each.sense(rgb, number)
         return rgb

@@ -19,7 +19,7 @@ class Photometric:
 
     gains: tuple[float, float, float]
     noise: float  # standard deviation in grey levels
-    first: int  # where in the bank of noise the first image's begins
+    first: int  # where the first image's noise begins in the bank of noise
 
     @classmethod
     def draw(cls, level: int, rng: np.random.Generator) -> Self:
@@ -30,7 +30,7 @@ class Photometric:
         return cls((red, green, blue), noise, int(rng.integers(NOISE_SPAN)))
 
     def __call__(self, rgb: np.ndarray, image: int) -> np.ndarray:
-        """(H, W, 3) uint8 -> the same, of the `image`-th image of an episode."""
+        """(H, W, 3) uint8, the `image`-th image of an episode -> the image after the changes."""
         start = (self.first + image * NOISE_STRIDE) % NOISE_SPAN
         noise = _noise_bank(rgb.size, self.noise)[start : start + rgb.size].reshape(rgb.shape)
         values = rgb * _gain_table(self.gains, rgb.shape)
@@ -48,5 +48,5 @@ def _noise_bank(size: int, std: float) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _gain_table(gains: tuple[float, float, float], shape: tuple[int, int, int]) -> np.ndarray:
-    """Gain of every value of an image, in fixed point: multiplying by it whole is fast."""
+    """(H, W, 3) uint16 gains of an image's values, in fixed point; a full array multiplies faster."""
     return np.broadcast_to(np.rint(np.array(gains) * (1 << GAIN_BITS)).astype(np.uint16), shape).copy()

@@ -1,4 +1,4 @@
-"""One episode, step by step, by any agent. This module imports neither torch nor LeRobot."""
+"""One episode run step by step, by any agent. This module imports neither torch nor LeRobot."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -43,7 +43,7 @@ class Moment:
 
 
 def make_env(spec: EpisodeSpec, render_options: RenderOptions) -> gymnasium.Env:
-    """BOMB from Gymnasium's registry; it starts MuJoCo and OpenGL on its first reset."""
+    """Make BOMB from Gymnasium's registry; it starts MuJoCo and OpenGL on its first reset."""
     return gymnasium.make(
         ENV_ID.format(suite=spec.suite),
         disable_env_checker=True,
@@ -58,10 +58,10 @@ def run_episode(
     agent: Agent,
     disturb: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Iterator[Moment]:
-    """Run a spec's episode in an `env` of that spec; while a moment is looked at, `env` is in it.
+    """Run a spec's episode in an `env` of that spec; yield each moment while `env` is in it.
 
-    What is executed is the agent's action as `disturb` changes it. The last moment is what the last action
-    led to.
+    The executed action is the agent's, as `disturb` changes it. The last moment is the state after the last
+    action.
     """
     observation, info = env.reset(seed=spec.seed)
     step, ended = 0, False
@@ -81,7 +81,7 @@ def one_of_batch(
 ) -> Iterator[Agent]:
     """Yield the agent of one seed, which at the same time acts in the other episodes of its batch.
 
-    lerobot-eval runs consecutive seeds as a batch, in which a policy's arithmetic rounds otherwise than
+    lerobot-eval runs consecutive seeds as a batch, in which a policy's arithmetic rounds differently than
     alone. The other episodes run here, unseen.
     """
     others = {i: FreezeAfterEnd(make_env()) for i in range(size) if i != row}
@@ -103,12 +103,12 @@ def one_of_batch(
 
 
 def expert_agent(expert: Expert = expert_action) -> Agent:
-    """The scripted expert, which acts on the simulator's true state."""
+    """Return the scripted expert, which acts on the simulator's true state."""
     return lambda observation, _: expert(PrivilegedState.from_vector(observation[ENVIRONMENT_STATE]))
 
 
 def random_agent(env: gymnasium.Env, seed: int) -> Agent:
-    """Actions drawn uniformly from the action space, the same for the same seed."""
+    """Return an agent that draws actions uniformly from the action space, the same for the same seed."""
     env.action_space.seed(seed)
     return lambda *_: env.action_space.sample()
 

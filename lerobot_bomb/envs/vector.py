@@ -29,7 +29,7 @@ def check_parallel_tasks(number: int) -> None:
 
 
 class FreezeAfterEnd(gym.Wrapper):
-    """Keep returning the last transition after an episode has ended, through autoreset too.
+    """Wrapper that keeps returning the last transition after an episode has ended, through autoreset too.
 
     LeRobot steps a batch until its slowest episode ends. Without this, the finished ones would be
     reset by the vector env and simulated for nothing. Only a reset that carries ``NEW_ROLLOUT_OPTION``
@@ -59,7 +59,7 @@ def light_children() -> Iterator[None]:
 
     multiprocessing re-runs the main script's imports in every child (for ``lerobot-eval``: LeRobot and
     torch, many seconds and hundreds of MB). The env factories live in importable modules, so the
-    children do not need it.
+    children do not need that script.
     """
     main = sys.modules["__main__"]
     hidden = {name: main.__dict__.pop(name) for name in ("__file__", "__spec__") if name in main.__dict__}
@@ -84,12 +84,12 @@ class LazyVectorEnv(VectorEnv):
         make_ones: one picklable factory per env, of torch-free modules.
         use_async: a worker process per env (`AsyncVectorEnv`); else all in this process.
         context: multiprocessing start method of the workers.
-        known_late: gives, for so many envs, the keyword arguments of each one's factory that are known only
-            when they start.
-        on_first_reset: is given the observations of the first reset, in this process.
-        last_query: gives the query that the policy was asked since it was called last, if any; before a step,
-            each env's `add_query` is given it.
-        num_tasks: vector envs of the evaluation, this one among them; each plays as many episodes.
+        known_late: number of envs -> keyword arguments of each one's factory that are known only when they
+            start.
+        on_first_reset: called with the observations of the first reset, in this process.
+        last_query: gives the policy's query since its last call, if any; each env's `add_query` gets it
+            before a step.
+        num_tasks: vector envs of the evaluation, this one among them; each runs as many episodes.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class LazyVectorEnv(VectorEnv):
 
     @contextmanager
     def _running(self) -> Iterator[SyncVectorEnv | AsyncVectorEnv]:
-        """Return the envs; after an error, which ends a worker, the next use starts all of them again."""
+        """Yield the envs; after an error, which ends a worker, the next use starts all of them again."""
         envs = self._ensure()
         try:
             yield envs
@@ -150,22 +150,22 @@ class LazyVectorEnv(VectorEnv):
             raise
 
     def begin_evaluation(self, num_episodes: int, seed: int | None) -> None:
-        """Take in that the next so many episodes are of an evaluation, which begins with this seed.
+        """Count the next `num_episodes` episodes in an evaluation, which begins with this seed.
 
-        LeRobot fills its last batch, and leaves the surplus out of its rate: of that there are no records.
+        LeRobot fills its last batch, and leaves the surplus out of its rate; the surplus leaves no records.
         """
         self._evaluation = Evaluation(num_episodes * self._num_tasks, seed)
         self._num_left = num_episodes
 
     def _tell_evaluation(self, envs: SyncVectorEnv | AsyncVectorEnv) -> None:
-        """Tell each env which evaluation its next episode is of, and whether that counts it."""
+        """Tell each env which evaluation its next episode belongs to, and whether it counts there."""
         is_over = self._num_left <= 0
         envs.set_attr("evaluation", None if is_over else self._evaluation)
         envs.set_attr("is_counted", [is_over or row < self._num_left for row in range(self.num_envs)])
         self._num_left -= self.num_envs
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start new episodes; autoreset, which does not, calls the envs themselves."""
+        """Start new episodes; autoreset, which starts none, calls the envs themselves."""
         options = {NEW_ROLLOUT_OPTION: True, **(options or {})}
         with self._running() as envs:
             self._tell_evaluation(envs)

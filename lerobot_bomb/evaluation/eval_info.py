@@ -1,4 +1,4 @@
-"""Lines of results of LeRobot's own environments, from the eval_info.json that lerobot-eval writes."""
+"""Records of LeRobot's own environments, from the eval_info.json that lerobot-eval writes."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -30,10 +30,10 @@ def results_of(
     batch_size: int,
     first: int = 0,
 ) -> Iterator[StockResult]:
-    """The result of each episode, in the order of tasks and seeds.
+    """Yield the result of each episode, in the order of tasks and seeds.
 
     Args:
-        info: what lerobot-eval wrote.
+        info: contents of lerobot-eval's eval_info.json.
         env: the environment's flags.
         policy: who acted.
         seed: of the first episode.
@@ -72,6 +72,6 @@ def _settings(env: EnvConfig, record_type: type[StockResult]) -> dict[str, Any]:
 
 
 def _image_size(env: EnvConfig) -> str:
-    """'640x480': width and height of the first camera's images."""
+    """Width and height of the first camera's images, as '640x480'."""
     sizes = [each.shape[:2] for each in env.features.values() if each.type is FeatureType.VISUAL]
     return "{1}x{0}".format(*sizes[0]) if sizes else NOT_RECORDED

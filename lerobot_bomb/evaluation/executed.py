@@ -21,7 +21,7 @@ class ActionLog:
 
     name: str  # of the dataset or file
     fps: float  # actions a second
-    episodes: dict[str, np.ndarray]  # {what tells an episode apart: (T, D)}
+    episodes: dict[str, np.ndarray]  # {name of an episode: (T, D)}
     is_seeded: bool  # the same episode of another file has the same start
 
     def __post_init__(self) -> None:
@@ -71,7 +71,7 @@ def executed_in_dataset(meta: LeRobotDatasetMetadata, name: str) -> ActionLog:
 def append_episode(
     path: Path, group: str, task_id: int, seed: int, fps: float, actions_TD: np.ndarray
 ) -> None:
-    """Add an episode's line; the first four tell it apart from others and how fast it was."""
+    """Append a line with an episode's group, task, seed and rate, and its actions."""
     row = {"group": group, "task_id": task_id, "seed": seed, "fps": fps, "actions": actions_TD.tolist()}
     append_line(path, json.dumps(row))
 
@@ -82,10 +82,10 @@ def start_of(episode: str) -> str:
 
 
 def read_action_log(path: Path) -> ActionLog:
-    """The episodes that ``append_episode`` wrote.
+    """Read the episodes that ``append_episode`` wrote.
 
     Raises:
-        ValueError: a line is none of those, is of an episode that came before or of another rate.
+        ValueError: a line holds no episode, repeats one, or has another rate.
     """
     episodes: dict[str, np.ndarray] = {}
     rates = set()

@@ -26,7 +26,7 @@ def measure_l1(
     episode_R: np.ndarray,
     dim_names: list[str],
 ) -> L1:
-    """L1 of predicted chunks; steps beyond an episode's end do not count.
+    """Measure the L1 of predicted chunks; steps beyond an episode's end do not count.
 
     A step of the chunk that lies beyond the end for every frame is left out, and those after it.
     """

@@ -68,7 +68,7 @@ def check_policy(config: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_
 
 
 def load_network(config: PreTrainedConfig) -> PreTrainedPolicy:
-    """The checkpoint's network on the config's device, for evaluation."""
+    """Load the checkpoint's network on the config's device, for evaluation."""
     policy = get_policy_class(config.type).from_pretrained(str(config.pretrained_path), config=config)
     return policy.to(str(config.device)).eval()
 
@@ -88,7 +88,7 @@ def load_dataset(
 def predict(
     policy: PreTrainedPolicy, dataset: LeRobotDataset, rows_R: np.ndarray, batch_size: int, title: str
 ) -> Predictions:
-    """Losses and decoded chunks of these rows of the dataset."""
+    """Compute losses and decoded chunks for these rows of the dataset."""
     preprocess, postprocess = load_processors(policy.config)
     loader = DataLoader(Subset(dataset, rows_R.tolist()), batch_size=batch_size)
     losses, chunks = [], []
@@ -107,12 +107,12 @@ def predict(
 
 
 def _row(batch: dict[str, Any], row: int) -> dict[str, Any]:
-    """One row as a batch of one."""
+    """Return one row as a batch of one."""
     return {key: values[row : row + 1] for key, values in batch.items()}
 
 
 def _losses(policy: PreTrainedPolicy, preprocess: Preprocessor, frame: dict[str, Any]) -> dict[str, float]:
-    """Loss and sub-losses of one frame: alone, so that no neighbour in a batch weighs in."""
+    """Compute loss and sub-losses of one frame, alone, so that no other frame in a batch weighs in."""
     torch.manual_seed(int(frame["index"]))  # policies that draw noise draw the same in every run
     loss, sub_losses = policy.forward(preprocess(frame))
     return {LOSS: float(loss), **{name: float(x) for name, x in (sub_losses or {}).items() if _is_number(x)}}

@@ -33,8 +33,8 @@ class SmoothnessRow:
     fps: float
     num_skipped: int  # episodes that are too short
     num_actions: dict[str, int]  # of each episode
-    measures: dict[str, Estimate]  # of all
-    episodes: dict[str, dict[str, float]]  # of each
+    measures: dict[str, Estimate]  # of all episodes
+    episodes: dict[str, dict[str, float]]  # measures of each
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def make_units(dataset: ActionLog, names: list[str], exclude: list[str] | None, 
 
 
 def check_comparable(compared: list[ActionLog], per_second: bool) -> None:
-    """Raise a ValueError unless all are named once and of one size; warn where their rates differ."""
+    """Raise a ValueError unless each is named once and all have as many dims; warn if their rates differ."""
     dataset, *others = compared
     names = [executed.name for executed in compared]
     if doubled := [name for name in names if names.count(name) > 1]:
@@ -91,7 +91,7 @@ def measure_row(executed: ActionLog, units: Units) -> SmoothnessRow:
     """Measure the smoothness of a row; every difference within an episode counts the same.
 
     Raises:
-        ValueError: no episode has the actions that a third difference takes.
+        ValueError: no episode has enough actions for a third difference.
     """
     episodes = {
         name: actions_TD for name, actions_TD in executed.episodes.items() if len(actions_TD) >= MIN_ACTIONS
@@ -130,7 +130,7 @@ def _measures(
 
 
 def measure_difference(first: str, second: str, rows: dict[str, SmoothnessRow]) -> Difference:
-    """Subtract the first row's means from the second's; pairs of episodes of one seed are drawn together.
+    """Subtract the first row's means from the second's; the bootstrap draws pairs of one seed together.
 
     Raises:
         ValueError: they have no episode in common.

@@ -41,7 +41,7 @@ def parse_episodes(flag: str, text: str, num_episodes: int) -> list[int]:
 def trained_episodes(train_config: dict[str, Any], meta: LeRobotDatasetMetadata) -> list[int] | None:
     """Episodes of this dataset that lerobot-train trained on; None if it trained on another dataset.
 
-    With `dataset.eval_split` LeRobot keeps the last ones of every task for itself.
+    With `dataset.eval_split` LeRobot holds out the last episodes of every task.
     """
     dataset, root = train_config.get("dataset") or {}, dataset_of(train_config)
     if root is None:
@@ -75,7 +75,7 @@ def make_split(
     """Split by the flags; by default, the episodes that were trained on, and all others.
 
     Raises:
-        ValueError: an episode is asked for in both, or no episode is held out.
+        ValueError: an episode is named for both, or no episode is held out.
     """
     known = set(trained or [])
     if train is None:

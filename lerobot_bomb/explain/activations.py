@@ -1,4 +1,4 @@
-"""Activations of a language model: recorded, and put back into a pass over something else.
+"""Activations of a language model: recorded, and put back into a pass over other inputs.
 
 Shapes: `U` units, `N` rows of a pass, `L` tokens, `F` features.
 """
@@ -18,7 +18,7 @@ from lerobot_bomb.explain.scored_policy import DecoderLayer, TokenSpan
 LAYER, HEADS, MLP = "layer", "heads", "mlp"
 PARTS = (LAYER, HEADS, MLP)
 
-# what a part gave in each pass of a score, (N, L, F) each, by layer and part
+# outputs in each pass of a score, (N, L, F) each, by layer and part
 type Activations = dict[tuple[int, str], list[Tensor]]
 type Change = Callable[[Tensor], Tensor]
 
@@ -55,7 +55,7 @@ def restoring(
 ) -> Iterator[None]:
     """Put units of ``clean`` back into each row, in the passes of one score.
 
-    ``clean`` is of one row. A pass may have several rows for each of the score's, beside each other.
+    ``clean`` is of one row. A pass may have several adjacent rows for each row of the score.
     """
     restored: dict[tuple[int, str], list[tuple[int, Unit]]] = defaultdict(list)
     for row, units in enumerate(units_of_rows):
@@ -76,10 +76,10 @@ class _Restore:
     """Puts one part back, in the passes of one score."""
 
     clean: list[Tensor]
-    units: list[tuple[int, Unit]]  # row of the score, what is put back there
+    units: list[tuple[int, Unit]]  # (row of the score, unit put back there)
     num_rows: int  # of the score
     num_heads: int
-    num_passes: int = 0  # that there were
+    num_passes: int = 0  # so far
 
     def __call__(self, values_NLF: Tensor) -> Tensor:
         clean_NLF = self.clean[self.num_passes]
@@ -99,7 +99,7 @@ def _changed(layers: Sequence[DecoderLayer], changes: Mapping[tuple[int, str], C
     """Change the outputs of parts; the hooks are removed afterwards, whatever happens.
 
     Raises:
-        ValueError: the layers' own outputs cannot be had.
+        ValueError: the layers' own outputs cannot be hooked.
     """
     with ExitStack() as stack:
         for (layer, part), change in changes.items():

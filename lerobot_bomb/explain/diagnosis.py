@@ -9,7 +9,7 @@ from lerobot_bomb.explain.restoration import smallest_drop
 
 SHARE = 0.05  # an effect below this share of the largest of its kind is none
 MAX_NAMES = 6  # that are shown
-RESTORES = 0.5  # what a head alone must bring back to be named
+RESTORES = 0.5  # share of the drop that a head alone must restore to be named
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Finding:
     def of_effects(cls, question: str, effects: Mapping[str, float], *, is_weak: bool) -> Self:
         """Name the parts with an effect, the largest first, at most a few.
 
-        ``is_weak``: the largest is below a SHARE of what has the largest effect of all.
+        ``is_weak``: the largest is below a SHARE of the largest effect of any kind.
         """
         shown = [f"{name} ({effect:.2g})" for name, effect in effects.items()]
         more = len(shown) - MAX_NAMES
@@ -71,7 +71,7 @@ def diagnose(explanation: Explanation) -> list[Finding]:
 
 
 def used(effects: Mapping[str, float], clean_score: float) -> dict[str, float]:
-    """Effects that are more than rounding and more than a SHARE of the largest, the largest first."""
+    """Return effects that are more than rounding and a SHARE of the largest, the largest first."""
     smallest = max(smallest_drop(clean_score), SHARE * _largest(effects))
     found = {name: effect for name, effect in effects.items() if abs(effect) > smallest}
     return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))

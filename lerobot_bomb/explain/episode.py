@@ -49,7 +49,7 @@ class ExplainedMoment:
         return ", ".join(part for part in (f"step {self.snapshot.step}", self.snapshot.phase) if part)
 
     def as_json(self) -> dict[str, Any]:
-        """JSON-ready, without the images."""
+        """Return the moment as JSON values, without the images."""
         return {
             "step": self.snapshot.step,
             "phase": self.snapshot.phase,
@@ -68,9 +68,9 @@ def explain_moment(
     control_mode: str | None,
     other: Snapshot,
 ) -> ExplainedMoment:
-    """Ask everything; ``other``: a moment of another episode, which may stand in place of this one's scene.
+    """Explain a moment; ``other``: a moment of another episode, whose scene may replace this one's.
 
-    ``control_mode``: of BOMB's actions; None elsewhere, where nothing is said of following.
+    ``control_mode``: of BOMB's actions; None elsewhere, where following is not measured.
     """
     observation = loaded.observe([snapshot.observation], [snapshot.instruction])
     instead = loaded.observe([other.observation], [other.instruction])
@@ -91,7 +91,7 @@ def explain_moment(
 
 
 def mean_states(question: Question) -> dict[str, np.ndarray]:
-    """(layers, F) of instruction and answer: each layer's states, means over tokens and draws."""
+    """{instruction, answer: (layers, F) states}, means over tokens and draws; {} if not available."""
     policy = question.policy
     if not policy.layers or any(layer.layer is None for layer in policy.layers):
         return {}
@@ -112,7 +112,7 @@ def _query(loaded: LoadedPolicy, snapshot: Snapshot, settings: Settings, instead
     except ValueError:
         if settings.words:
             raise
-        offsets = []  # one that reads no instruction
+        offsets = []  # a policy that reads no instruction
     objects = {
         f"{OBS_IMAGES}.{camera}": {what: torch.from_numpy(mask) for what, mask in masks.items()}
         for camera, masks in snapshot.objects.items()

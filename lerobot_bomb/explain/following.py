@@ -1,4 +1,4 @@
-"""Following of a changed word of the instruction by a policy's next actions, in millimetres."""
+"""Measure, in millimetres, of how a policy's next actions follow a changed word of the instruction."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ def following(
     target: Intersection,
     control_mode: str,
 ) -> dict[str, Following]:
-    """Measure how actions follow each other instruction to its place, from the same observation and noise."""
+    """Measure how actions follow each of the other instructions, from the same observation and noise."""
     clean = _end_xy(loaded, observation, control_mode)
     found = {}
     for word, (instruction, intersection) in others.items():

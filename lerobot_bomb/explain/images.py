@@ -1,4 +1,4 @@
-"""Parts of an image that are taken away.
+"""Parts of an image that are taken out, and the pixels in their place.
 
 Shapes: `M` masks, `H`, `W` of an image in pixels.
 """
@@ -42,7 +42,7 @@ def filling(image_3HW: Tensor, kind: str, blur_px: float, other_3HW: Tensor | No
         return image_3HW.mean(dim=(1, 2), keepdim=True).expand_as(image_3HW)
     if kind == "blur":
         side = min(image_3HW.shape[1:])
-        reach = min(round(3 * blur_px), (side - 1) // 2)  # what is reflected at the edge must be there
+        reach = min(round(3 * blur_px), (side - 1) // 2)  # reflection at an edge needs as many pixels
         return gaussian_blur(image_3HW, [2 * reach + 1] * 2, [blur_px] * 2)
     if other_3HW is None or other_3HW.shape != image_3HW.shape:
         raise ValueError("--fill=other needs an image of another episode, of the same size")

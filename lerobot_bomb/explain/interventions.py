@@ -49,7 +49,7 @@ class BlankImages(ObservationProcessorStep):
 @ProcessorStepRegistry.register(REPLACE_TASKS)
 @dataclass
 class ReplaceTasks(ComplementaryDataProcessorStep):
-    """The policy is given another instruction; one that has no replacement is an error."""
+    """Intervention in which the policy gets another instruction; one without a replacement is an error."""
 
     replacements: dict[str, str]  # instruction -> what the policy is given instead
 
@@ -77,7 +77,7 @@ class ReplaceTasks(ComplementaryDataProcessorStep):
 
 
 def intervene(checkpoint: Path | str, steps: Sequence[ProcessorStep], output: Path | str) -> None:
-    """Write `output`, a copy of a checkpoint, a folder or `bomb:NAME`, with `steps` before its preprocessor.
+    """Write `output`: a copy of a checkpoint (folder or `bomb:NAME`), with `steps` before its preprocessor.
 
     Raises:
         ValueError: `checkpoint` is no checkpoint, `output` exists, or there are no steps.

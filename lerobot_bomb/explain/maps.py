@@ -31,11 +31,11 @@ def overlay(map_GG: np.ndarray, largest: float, image: np.ndarray) -> np.ndarray
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """(H, W, 3) uint8 RGB as a file."""
+    """Encode (H, W, 3) uint8 RGB as a PNG file."""
     _, content = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     return content.tobytes()
 
 
 def data_url(image: np.ndarray) -> str:
-    """(H, W, 3) uint8 RGB as a page holds it."""
+    """Encode (H, W, 3) uint8 RGB as the URL of an image in a page."""
     return f"data:image/png;base64,{base64.b64encode(png_bytes(image)).decode()}"

@@ -21,12 +21,12 @@ from lerobot_bomb.results.record import Record
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 from lerobot_bomb.viewing.episode import Viewed
 
-# what a policy gets in place of an observation in an environment
+# observation and environment -> what the policy gets in its place
 type Change = Callable[[Batch, gymnasium.Env], Batch]
-# what its preprocessor makes of that, changed; and the instruction
+# the preprocessor's output and the instruction -> what the policy gets in its place
 type PreparedChange = Callable[[Batch, str], Batch]
 
-BLURS = 16  # of an image's side, a blur's standard deviation
+BLURS = 16  # an image's side, in standard deviations of a blur
 
 
 def nothing(batch: Batch, _: gymnasium.Env | str) -> Batch:
@@ -47,7 +47,7 @@ class MaskedEpisode:
     """An episode that was run under a mask."""
 
     gripper_xyz: np.ndarray  # (T + 1, 3) metres, before each step and at the end
-    result: Any  # the line of its results
+    result: Any  # its record
 
 
 def without_object(name: str, fill: str) -> Mask:
@@ -70,7 +70,7 @@ def without_object(name: str, fill: str) -> Mask:
 
 
 def without_words(loaded: LoadedPolicy, words: Callable[[str], Span | None]) -> Mask:
-    """Tokens of an instruction that no other token reads; ``words``: which, None if there are none in it."""
+    """Hide tokens of an instruction from all others; ``words``: instruction -> span to hide, or None."""
     policy = scored(loaded.policy, loaded.postprocess)
 
     def hide(prepared: Batch, instruction: str) -> Batch:

@@ -41,7 +41,7 @@ class MomentQuery:
 
 @dataclass(frozen=True)
 class PatchingResult:
-    """Result of activation patching: R of every unit for one corruption; NaN where it is not defined."""
+    """Result of activation patching: R (see `restoration`) of all units for a corruption, or NaN."""
 
     corruption: str
     drop: float  # of the score
@@ -64,11 +64,11 @@ class Explanation:
 
     @property
     def largest_patch(self) -> float:
-        """The largest effect of a patch of any image: maps of one moment have one scale."""
+        """Largest effect of a patch of any image: maps of one moment have one scale."""
         return max(float(map_GG.max()) for map_GG in self.patches.values())
 
     def as_json(self) -> dict[str, Any]:
-        """JSON-ready; not a number becomes None."""
+        """Return the explanation as JSON values; NaN becomes None."""
         values = vars(self) | {
             "patches": {key: each.tolist() for key, each in self.patches.items()},
             "restored": [vars(each) for each in self.restored],
@@ -85,7 +85,7 @@ def _finite(value: Any) -> Any:
 
 
 def explain(question: Question, query: MomentQuery) -> Explanation:
-    """Ask all of it.
+    """Measure all effects of a query.
 
     Raises:
         ValueError: the grid does not divide an image, or as `filling`.
@@ -116,7 +116,7 @@ def image_keys(question: Question) -> list[str]:
 
 
 def camera_name(key: str) -> str:
-    """'workspace' of 'observation.images.workspace'."""
+    """Return 'workspace' for 'observation.images.workspace'."""
     return key.removeprefix(f"{OBS_IMAGES}.").removeprefix(f"{OBSERVATION}.")
 
 
@@ -175,7 +175,7 @@ def _corruptions(
     words: Mapping[str, float],
     others: Mapping[str, float],
 ) -> list[tuple[str, Rows]]:
-    """The strongest patch, span and other instruction, another episode's scene: name, what is read then."""
+    """Return (name, rows): the strongest patch, span and other instruction, and another episode's scene."""
     if not question.policy.layers:
         return []
     found = []
@@ -200,7 +200,7 @@ def _corruptions(
 
 
 def _has_columns_of(rows: Rows, others: Rows) -> bool:
-    """Tokens are put back one by one, so there must be as many, and padding where there is padding."""
+    """Return True if rows have as many tokens, and the same padding: states are put back token by token."""
     return all(
         value.shape == others[key].shape and (value.dtype != torch.bool or value.equal(others[key]))
         for key, value in rows.items()

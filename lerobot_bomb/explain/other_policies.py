@@ -1,4 +1,4 @@
-"""Policies that are not ours, as explanations ask them.
+"""Policies that are not ours, scored for explanations.
 
 Shapes: `B` rows, `J` draws of noise and time, `K` actions of a chunk, `D` action dims.
 """
@@ -19,7 +19,7 @@ SEED = 0
 
 
 def scored(policy: Any, postprocess: Callable[[Tensor], Tensor]) -> ScoredPolicy:
-    """One of ours as it explains itself, a flow policy of LeRobot's by its loss, any other by distance.
+    """Wrap a policy for scoring: ours by its own method, LeRobot's flow policies by loss, others by distance.
 
     ``postprocess``: (B, D) actions -> the same in physical units.
     """
@@ -32,7 +32,7 @@ def scored(policy: Any, postprocess: Callable[[Tensor], Tensor]) -> ScoredPolicy
 
 
 class _ScoredByBatch(ScoredPolicy):
-    """Rows are the batch's tensors as they are."""
+    """Policy whose rows are the batch's tensors as they are."""
 
     def __init__(self, policy: Any):
         self._policy = policy
@@ -82,9 +82,9 @@ class ScoredByLoss(_ScoredByBatch):
 
 
 class ScoredByDistance(_ScoredByBatch):
-    """Explanation of any policy: minus the mean distance of executed actions (1, T, D) from the clean ones.
+    """Any policy, scored by minus the mean distance of executed actions (1, T, D) from the clean ones.
 
-    Rows are asked one by one, each from a fresh start and with the same random numbers.
+    Rows are scored one by one, each from a fresh start and with the same random numbers.
     """
 
     unit: ClassVar[str] = "distance of actions"
@@ -127,7 +127,7 @@ def _seeded() -> Iterator[None]:
 
 @contextmanager
 def _same_draws(model: Any, num_rows: int) -> Iterator[None]:
-    """Let a flow model draw the same noise for each row; each stands there NUM_DRAWS times."""
+    """Let a flow model draw the same noise for each row; each is repeated NUM_DRAWS times."""
 
     def sample_noise(shape: tuple[int, ...], device: torch.device | str) -> Tensor:
         draws = torch.randn((NUM_DRAWS, *shape[1:]), generator=torch.Generator().manual_seed(SEED))

@@ -1,4 +1,4 @@
-"""Pointing beside the truth: does a policy read stone and place right, and does its next action go there?"""
+"""Pointing and the truth: does a policy read stone and place right, and does its next action go there?"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ FONT, FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.5
 
 @dataclass(frozen=True)
 class Mark:
-    """A ring where a policy points, a cross where that is, or is to be."""
+    """A ring where a policy points, or a cross at the true stone or place."""
 
     xyz: np.ndarray  # (3,) metres
     rgb: tuple[int, int, int]
@@ -48,7 +48,7 @@ class PointingCheck:
 
     @property
     def meant(self) -> Meant:
-        """Stone and place that the expert is about."""
+        """Stone and place of the expert."""
         return Meant.in_state(self.state)
 
     @property
@@ -58,27 +58,27 @@ class PointingCheck:
 
     @property
     def meant_place(self) -> str:
-        """Name of the place that is meant."""
+        """Name of the expert's place."""
         return place_name(self.meant.place_xy)
 
     @property
     def place_mm(self) -> float:
-        """Distance from the place that is pointed at to the one that is meant."""
+        """Distance from the place that is pointed at to the expert's."""
         return 1e3 * float(np.linalg.norm(self.pointed.place_xy - self.meant.place_xy))
 
     @property
     def stone_mm(self) -> float:
-        """Distance from where the policy points to the stone that is meant."""
+        """Distance from where the policy sees the stone to the expert's stone."""
         return 1e3 * float(np.linalg.norm(self.pointed.stone_xy - self.meant.stone_xy))
 
     @property
     def is_place_right(self) -> bool:
-        """Tell whether both are one intersection, or in the tray."""
+        """Return True if both places are one intersection, or in the tray."""
         return self.place == self.meant_place
 
     @property
     def is_stone_right(self) -> bool:
-        """Tell whether it points at some part of the stone that is meant."""
+        """Return True if the policy points at some part of the expert's stone."""
         return self.stone_mm <= 1e3 * self.state.stone_radius_m
 
     @property
@@ -108,7 +108,7 @@ class PointingCheck:
 
     @property
     def finding(self) -> Finding:
-        """Diagnosis: did it misread, or does it know and not act?"""
+        """Diagnosis: does the policy misread, or does it know and not act?"""
         misread = [*self._misread()]
         verdict = f"it misreads the {' and the '.join(misread)}" if misread else "all as is meant"
         if not self.goes_there:
@@ -142,7 +142,7 @@ class PointingCheck:
         ]
 
     def as_json(self) -> dict[str, Any]:
-        """JSON-ready, in metres and millimetres."""
+        """Return the check as JSON values, in metres and millimetres."""
         pointed, meant = self.pointed, self.meant
         return {
             "place": self.place,
@@ -165,7 +165,7 @@ class PointingCheck:
 def check_pointing(
     loaded: LoadedPolicy, scored: ScoredPolicy, observation: Batch, state: PrivilegedState | None
 ) -> PointingCheck | None:
-    """Compare pointing and next action with the truth; None if the policy does not point or it is unknown."""
+    """Compare pointing and next action with the truth; None without pointing, or without a known truth."""
     if state is None:
         return None
     loaded.begin()
@@ -175,7 +175,7 @@ def check_pointing(
 
 
 def marked(image: np.ndarray, camera: PinholeCamera, marks: list[Mark]) -> np.ndarray:
-    """(H, W, 3) uint8 -> the same of MARKED_PX pixels a side, with marks on it; crosses with their names."""
+    """(H, W, 3) uint8 -> (MARKED_PX, MARKED_PX, 3), with marks on it; crosses with their names."""
     shown = cv2.resize(image, (MARKED_PX, MARKED_PX), interpolation=cv2.INTER_NEAREST)
     scale = MARKED_PX / image.shape[0]
     for mark in marks:

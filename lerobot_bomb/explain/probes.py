@@ -1,7 +1,7 @@
 """Probes of a layer's states by a linear map: where is the destination known?
 
-A probe is a ridge regression; it is judged on episodes that it was not fitted to, beside the same with
-shuffled labels, which is what a probe of so many features finds in nothing.
+A probe is a ridge regression. It is judged on held-out episodes, beside probes of shuffled labels: their
+score is what so many features find in nothing.
 
 Shapes: `N` episodes, `F` features, `C` classes or coordinates.
 """
@@ -19,7 +19,7 @@ PENALTY = 1.0  # times the number of episodes that are fitted, on features of un
 
 @dataclass(frozen=True)
 class Probe:
-    """Accuracy of labels that were read off states, on episodes that were held out."""
+    """Score of a probe, which reads labels off states, on held-out episodes."""
 
     score: float  # share of right classes, or the share of variance that is explained (R squared)
     floor: float  # the same with shuffled labels, mean of NUM_SHUFFLES
@@ -66,8 +66,8 @@ def probe_values(features_NF: np.ndarray, values_NC: np.ndarray, seed: int = 0) 
 class LayerProbe:
     """A probe of one layer's states."""
 
-    what: str  # that is read
-    place: str  # of the tokens
+    what: str  # label that is read
+    place: str  # span of the tokens
     layer: int
     probe: Probe
 
@@ -105,7 +105,7 @@ def _split(num_episodes: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 def _predict(
     features_NF: np.ndarray, targets_NC: np.ndarray, train: np.ndarray, test: np.ndarray
 ) -> np.ndarray:
-    """Targets of the episodes ``test`` by a ridge regression on ``train``, solved in its dual form."""
+    """Predict targets of episodes ``test`` by a ridge regression on ``train``, solved in its dual form."""
     mean_F, std_F = features_NF[train].mean(axis=0), features_NF[train].std(axis=0)
     scaled_NF = (features_NF - mean_F) / np.where(std_F > 0, std_F, 1) / np.sqrt(features_NF.shape[1])
     known_NF, mean_C = scaled_NF[train], targets_NC[train].mean(axis=0)

@@ -1,7 +1,7 @@
-"""Question about one moment: how far does a policy's hold on its answer drop when some of it changes?
+"""Question about one moment: how far does the score of a policy's answer drop when its input changes?
 
 The effect of a change is the score of the clean answer before minus after it (seed study of BOMB, E_patch and
-E_text): positive where what was changed spoke for the answer.
+E_text): positive where the changed input spoke for the answer.
 
 Shapes: `M` changes, `S` tokens of an instruction, `H`, `W` of an image in pixels.
 """
@@ -18,9 +18,9 @@ BATCH_SIZE = 64  # rows of a forward pass
 
 
 class Question:
-    """One observation of one episode, asked of a policy.
+    """One observation of one episode, and a policy's answer to it.
 
-    What is the same in all rows of a question goes through the vision model once.
+    Images that are the same in all rows of a question go through the vision model once.
     """
 
     def __init__(
@@ -45,24 +45,24 @@ class Question:
         return self.policy.encode(self._prepare({**repeated(self.observation, times), **changes}))
 
     def effects(self, rows: Rows) -> Tensor:
-        """(M,) of what each row reads in place of the observation."""
+        """(M,) effects of what each row reads in place of the observation."""
         return self.clean_score - scores_of(self.policy, rows, self.answer, self._batch_size)
 
     def effects_of_images(self, changed: dict[str, Tensor]) -> Tensor:
-        """(M,) of other images (M, 3, H, W), by key."""
+        """(M,) effects of other images (M, 3, H, W), by key."""
         return self.effects(self.encode(changed, len(next(iter(changed.values())))))
 
     def effects_of_masks(self, key: str, masks_MHW: Tensor, filling_3HW: Tensor) -> Tensor:
-        """(M,) of the parts of one camera's image."""
+        """(M,) effects of taking parts out of one camera's image."""
         (image_3HW,) = self.observation[key]
         parts = masks_MHW.split(self._batch_size)
         images = (occluded(image_3HW, part, filling_3HW) for part in parts)
         return torch.cat([self.effects_of_images({key: each}) for each in images])
 
     def effects_of_hidden(self, hidden_MS: Tensor) -> Tensor:
-        """(M,) of tokens of the instruction that no other token reads."""
+        """(M,) effects of hiding tokens of the instruction from all others."""
         return self.effects(self.policy.hide(self.rows, hidden_MS))
 
     def effects_of_instructions(self, instructions: Sequence[str]) -> Tensor:
-        """(M,) of other instructions."""
+        """(M,) effects of other instructions."""
         return self.effects(self.encode({"task": [*instructions]}, len(instructions)))

@@ -34,7 +34,7 @@ def _log_marks(recording: rr.RecordingStream, key: str, moment: ExplainedMoment)
         return
     camera, marks = moment.snapshot.cameras[CAMERA], moment.pointing.marks
     points = rr.Points2D(
-        # corners of pixels are whole numbers there, and centres here
+        # Rerun counts pixels from their corners, the camera from their centres
         [camera.pixel_of(mark.xyz) + 0.5 for mark in marks],
         colors=[mark.rgb for mark in marks],
         labels=[mark.name for mark in marks],

@@ -36,7 +36,7 @@ class Restoration:
 
     @property
     def is_defined(self) -> bool:
-        """True if the corruption lowered the score by more than rounding does."""
+        """True if the corruption changed the score by more than rounding does."""
         return abs(self.clean_score - self.corrupt_score) > smallest_drop(self.clean_score)
 
     @property
@@ -48,10 +48,10 @@ class Restoration:
 
 
 class Corruption:
-    """A question, and the same with something of its input changed."""
+    """A question, and a row with some of its input changed."""
 
     def __init__(self, question: Question, rows: Rows):
-        """``rows``: one, what is read in place of the observation."""
+        """``rows``: one row, which is read in place of the observation's."""
         self._question, self.rows = question, rows
         self._layers = question.policy.layers
         self.clean = self._record(question.rows)
@@ -68,7 +68,7 @@ class Corruption:
         return activations
 
     def restore(self, units_of_rows: Sequence[Sequence[Unit]], batch_size: int = BATCH_SIZE) -> Restoration:
-        """Put back the activations that each row names, in batches; nothing is encoded again."""
+        """Put back the units of each row, in batches; nothing is encoded again."""
         return self._restore(self.clean, units_of_rows, batch_size)
 
     def restore_each(self, units: Sequence[Unit]) -> Tensor:

@@ -1,7 +1,7 @@
-"""Scored policy: how strongly does a policy hold to its clean answer?
+"""Policies that score their own answers.
 
-The answer is the one to what the policy really saw, and stays fixed; what is read, or what is computed on the
-way, is changed. A higher score means that the answer is more likely or closer.
+The answer is the one to the true observation, and stays fixed; what the policy reads, or computes on the way,
+is changed. A higher score means that the answer is more likely or closer.
 
 Shapes: `B` rows, `L` tokens of a prompt, `S` of an instruction, `K` actions of a chunk, `D` action dims.
 """
@@ -22,7 +22,7 @@ from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.vlm.inputs import OBS_LANGUAGE_HIDDEN
 from lerobot_bomb.vlm.layout import INSTRUCTION, PromptLayout
 
-type Batch = dict[str, Any]  # what a policy's preprocessor gives
+type Batch = dict[str, Any]  # output of a policy's preprocessor
 type Rows = dict[str, Tensor]  # what `ScoredPolicy.encode` makes of it; (B, ...) each
 # columns of a sequence in each pass through the decoder of one score; None: it has none in this pass
 type TokenSpan = tuple[Tensor | slice | None, ...]
@@ -34,7 +34,7 @@ ANSWER = "answer"
 class DecoderLayer:
     """A layer of the language model, and its parts."""
 
-    # whose output are the states; None where the policy calls the parts one by one
+    # its output is the states; None where the policy calls the parts one by one
     layer: nn.Module | None
     attention_out: nn.Module  # output projection; its input are the heads' outputs, side by side
     num_heads: int
@@ -74,7 +74,7 @@ class ScoredPolicy(ABC):
 
     @abstractmethod
     def hide(self, rows: Rows, hidden_BS: Tensor) -> Rows:
-        """One row -> B rows in which no other token reads these of the instruction.
+        """One row -> B rows, in each of which these tokens of the instruction are hidden from all others.
 
         Raises:
             ValueError: the policy reads no instruction.
@@ -82,7 +82,7 @@ class ScoredPolicy(ABC):
 
     @abstractmethod
     def hide_in(self, batch: Batch, hidden_S: Tensor) -> Batch:
-        """A batch of one row, in which the policy answers without these tokens of the instruction.
+        """Change a batch of one row so that the policy answers without these tokens of the instruction.
 
         Raises:
             ValueError: the policy reads no instruction.
@@ -101,7 +101,7 @@ class ScoredPolicy(ABC):
 
 
 class PromptPolicy(Protocol):
-    """Members of our policies that a score needs, whichever it is."""
+    """Members of our policies that every score needs."""
 
     layout: PromptLayout
     backbone: Any
@@ -139,7 +139,7 @@ class ScoredPromptPolicy(ScoredPolicy):
 
     @staticmethod
     def prompt(rows: Rows) -> TokenRows:
-        """The prompt of rows."""
+        """Return the prompt of rows."""
         return TokenRows(rows["ids"], rows["mask"], rows.get("hidden"))
 
     def hide(self, rows: Rows, hidden_BS: Tensor) -> Rows:
@@ -175,7 +175,7 @@ def repeated(values: Batch, times: int) -> Batch:
 
 
 def some(rows: Rows, start: int, stop: int) -> Rows:
-    """The rows from ``start`` up to ``stop``."""
+    """Return the rows from ``start`` up to ``stop``, which is left out."""
     return {key: value[start:stop] for key, value in rows.items()}
 
 

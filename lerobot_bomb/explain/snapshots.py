@@ -1,4 +1,4 @@
-"""An episode as a policy runs in it, and its moments that are worth an explanation."""
+"""Snapshots of an episode in which a policy acts, and the moments to explain."""
 
 from collections.abc import Mapping
 from contextlib import closing
@@ -34,19 +34,19 @@ class Snapshot:
     objects: Mapping[str, Mapping[str, np.ndarray]]  # {camera: {what: (H, W) bool}}; {}: not known
     others: Mapping[
         str, tuple[str, Intersection]
-    ]  # other instructions and what they name, by what they change
+    ]  # other instructions and the intersections that they name, by what they change
     target: Intersection | None
     state: PrivilegedState | None  # of BOMB
     cameras: Mapping[str, PinholeCamera]  # {}: not known
 
     @property
     def stone_xyz(self) -> np.ndarray | None:
-        """(3,) metres, of the one that is to be moved."""
+        """(3,) metres, centre of the stone that is to be moved."""
         return None if self.state is None else self.state.stone_xyz[current_goal(self.state).stone]
 
     @property
     def instructions(self) -> dict[str, str]:
-        """The other instructions, by what they change."""
+        """Other instructions, by what they change."""
         return {word: instruction for word, (instruction, _) in self.others.items()}
 
 
@@ -103,7 +103,7 @@ def middle_of_phases(moments: list[Snapshot]) -> list[Snapshot]:
 
 
 def at_step(moments: list[Snapshot], step: int) -> Snapshot:
-    """The moment before a control step.
+    """Return the moment before a control step.
 
     Raises:
         ValueError: the episode ended before.

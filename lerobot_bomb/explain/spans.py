@@ -27,7 +27,7 @@ class Span:
     ranges: tuple[Range, ...]  # of the instruction's characters
 
     def tokens(self, offsets: Sequence[Range]) -> Tensor:
-        """(S,) bool, which of the tokens of these characters hold any of the words."""
+        """(S,) bool: the token with these characters holds some of the words."""
         return torch.tensor(
             [any(first < end and start < last for start, end in self.ranges) for first, last in offsets],
             dtype=torch.bool,
@@ -35,7 +35,7 @@ class Span:
 
 
 def span_of(words: str, instruction: str) -> Span:
-    """Return where the words stand, all of them; neither part of another word nor of another number.
+    """Return the span of all occurrences of the words that are no part of another word or number.
 
     Raises:
         ValueError: they are not in the instruction.
@@ -54,7 +54,7 @@ def whole(instruction: str) -> Span:
 
 
 def spans_of_words(instruction: str) -> list[Span]:
-    """A span of each word and number; one that stands there twice is told apart: "0", "0 (2)"."""
+    """Return a span for each word and number; repeated ones get a number: "0", "0 (2)"."""
     spans: list[Span] = []
     for match in re.finditer(r"[\w']+", instruction):
         times = 1 + sum(span.name.split(" (")[0] == match[0] for span in spans)
@@ -63,7 +63,7 @@ def spans_of_words(instruction: str) -> list[Span]:
 
 
 def difference(name: str, instruction: str, other: str) -> Span | None:
-    """The words that another instruction has others for; None where it has another number of words.
+    """Return the words that differ in another instruction; None if none do, or their number differs.
 
     "place it at row 1, column 2", "place it at row 3, column 2" -> "1".
     """
@@ -85,12 +85,12 @@ def named_spans(instruction: str, others: Mapping[str, str]) -> list[Span]:
 
 
 def token_offsets(steps: Iterable[Any], instruction: str) -> list[Range]:
-    """Return the range of the instruction's characters of each token that a preprocessor's steps make of it.
+    """Return each token's range of characters in the instruction, for a preprocessor's steps.
 
-    Those of a template around it lie before its first or behind its last character.
+    Tokens of a template around it lie before its first or behind its last character.
 
     Raises:
-        ValueError: no step makes tokens, or its tokenizer does not say of what.
+        ValueError: no step makes tokens, or its tokenizer does not give their characters.
     """
     for step in steps:
         if isinstance(step, TaskTokenizerStep):

@@ -11,7 +11,7 @@ from lerobot_env_mujoco.mujoco_gl import mujoco
 from lerobot_env_mujoco.rotations import matrix_of
 from lerobot_env_mujoco.transforms import CameraTransform, least_distance
 
-FRAME_MARGIN = 0.015  # of half the image, that what must stay in view keeps from its edge
+FRAME_MARGIN = 0.015  # share of half the image, from its edge to what must stay in view
 START_HEIGHT_M = 0.115  # of the gripper over the tray, which must be in view too
 
 
@@ -35,7 +35,7 @@ class Camera(CameraTransform, Transform):
 
 
 def _least_distance(camera_from_world: np.ndarray, pivot: np.ndarray, fovy_deg: float) -> float:
-    """Metres from the pivot at which a square image shows board, tray and the gripper over the tray."""
+    """Metres from the pivot from which a square image shows board, tray and the gripper over the tray."""
     signs = np.array([(x, y) for x in (-1, 1) for y in (-1, 1)])
     board = _at_height(signs * BOARD.half_size_m, BOARD.thickness_m)
     tray = _at_height(TRAY_CENTER_XY + signs * TRAY_HALF_SIZE_XY, BOARD.thickness_m)

@@ -13,7 +13,7 @@ from lerobot_env_bomb.axes.transform import Transform
 
 @dataclass(frozen=True)
 class Wording(Transform):
-    """Template in place of the episode's."""
+    """Another template for the episode's instruction."""
 
     template: str
     other: tuple[int, int]  # row, column that the instruction may name but does not mean

@@ -19,7 +19,7 @@ GREY = 0.5
 
 @dataclass(frozen=True)
 class StoneLook(Transform):
-    """Size, shape and shade of all stones. The sizes are the layout's."""
+    """Size, shape and shade of all stones. The sizes go into the layout."""
 
     level: int
     radius_m: float

@@ -22,8 +22,8 @@ class Start(Transform):
     @classmethod
     def draw(cls, level: int, rng: np.random.Generator, nominal: Episode) -> Self:
         side = float(rng.choice((-1.0, 1.0)))
-        # Towards the board, for beyond the tray is no workspace, and along with the stone, which the arm
-        # would else hide from a camera that has swung.
+        # Towards the board, as there is no workspace beyond the tray, and to the stone's side, as the arm
+        # would else hide the stone from a camera that has swung.
         angle_rad = side * rng.uniform(0.5 * np.pi, 0.75 * np.pi)
         stone_m, gripper_m = (1e-3 * magnitude("start", what, level) for what in ("stone", "gripper"))
         gripper_offset = gripper_m * np.cos(angle_rad), gripper_m * np.sin(angle_rad)

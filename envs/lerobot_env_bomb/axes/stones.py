@@ -16,7 +16,7 @@ from lerobot_env_bomb.axes.transform import Transform
 
 @dataclass(frozen=True)
 class Stones(Transform):
-    """Stones beside the episode's on the board, none of them exactly on its intersection."""
+    """More stones on the board; no stone, old or new, is exactly on its intersection."""
 
     extra: Mapping[Intersection, str]  # (row, column) -> colour
     directions_rad: tuple[float, ...]  # of the shift of each stone, first those of the opening

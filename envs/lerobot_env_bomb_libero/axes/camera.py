@@ -9,8 +9,8 @@ from lerobot_env_bomb_libero.stock import mujoco
 from lerobot_env_mujoco.rotations import matrix_of
 from lerobot_env_mujoco.transforms import CameraTransform, least_distance
 
-FRAME_MARGIN = 0.02  # of half the image, that what must stay in view keeps from its edge
-GRIPPER_M = 0.1  # before the wrist's camera, what it turns around
+FRAME_MARGIN = 0.02  # share of half the image, from its edge to what must stay in view
+GRIPPER_M = 0.1  # from the wrist's camera to the point that it turns around
 MAX_RETREAT = 1.6  # times the nominal distance
 
 
@@ -48,6 +48,6 @@ def _looked_at(position: np.ndarray, pose: np.ndarray, points: np.ndarray) -> np
 
 
 def _is_in_view(offsets: np.ndarray, pose: np.ndarray, fovy_deg: float) -> np.ndarray:
-    """(n, 3) from a camera -> (n,) whether its square image shows them."""
+    """Offsets (n, 3) from a camera -> (n,) bool: its square image shows the point."""
     right, up, backward = offsets @ pose[:, 0], offsets @ pose[:, 1], offsets @ pose[:, 2]
     return np.maximum(abs(right), abs(up)) <= -backward * np.tan(np.radians(fovy_deg) / 2)

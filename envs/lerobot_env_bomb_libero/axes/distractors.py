@@ -18,21 +18,21 @@ SHAPES = ("box", "cylinder", "sphere")
 HALF_SIZE_M = 0.022
 RGB = ((0.9, 0.5, 0.1), (0.5, 0.2, 0.7), (0.1, 0.6, 0.6), (0.9, 0.3, 0.6), (0.35, 0.6, 0.15))
 CLEARANCE_M = 0.03  # from objects, fixtures and the gripper
-PATH_M = 0.08  # from the straight lines between what the task is about, and to it from the gripper
+PATH_M = 0.08  # from the straight lines between objects of the task, and from the gripper to them
 REACH_M = 0.34  # from the middle of the table along x and y
 SPACING_M = 0.03  # of the places that are tried
-ABOVE_M = 2.0  # from where a place is looked for downwards
-BETWEEN_M = 0.07  # two of them
+ABOVE_M = 2.0  # height from which a place is looked for downwards
+BETWEEN_M = 0.07  # any two distractors
 STEP_M = 0.05  # from the surface that objects stand on, at most
-IN_VIEW = 0.9  # of the image of the scene's camera, in whose middle they are
+IN_VIEW = 0.9  # share of the scene camera's image, around its middle, that holds them
 
 
 @dataclass(frozen=True)
 class Distractors(LiberoTransform):
-    """Fixed bodies: one more at each level, the others in the same places."""
+    """Fixed bodies; each level adds one and leaves the others in their places."""
 
     count: int
-    order: tuple[float, ...]  # of the places that are free, a number for each that is tried
+    order: tuple[float, ...]  # a number for each place, by which places are tried
     colors: tuple[int, ...]
     shapes: tuple[int, ...]
 
@@ -78,13 +78,13 @@ class Distractors(LiberoTransform):
 
 
 def _places() -> np.ndarray:
-    """(n, 2) metres, x and y."""
+    """(n, 2) metres, x and y of the places that are tried."""
     line = np.arange(-REACH_M, REACH_M + 1e-9, SPACING_M)
     return np.stack(np.meshgrid(line, line, indexing="ij"), -1).reshape(-1, 2)
 
 
 def _is_out_of_the_way(place: np.ndarray, boxes: list[np.ndarray], ends: list[np.ndarray]) -> bool:
-    """Return True if (2,) is far from (2, 3) boxes and from the lines between the places of the task."""
+    """Return True if a place (2,) is far from (2, 3) boxes and from the lines between the task's places."""
     gap = HALF_SIZE_M + CLEARANCE_M
     if any((place > low[:2] - gap).all() and (place < high[:2] + gap).all() for low, high in boxes):
         return False
@@ -92,7 +92,7 @@ def _is_out_of_the_way(place: np.ndarray, boxes: list[np.ndarray], ends: list[np
 
 
 def _spot_on_table(scene: LiberoScene, place: np.ndarray, surface_m: float) -> np.ndarray | None:
-    """(3,) the point of table or floor there, if the scene's camera sees it; `surface_m` high or so."""
+    """(3,) the point of table or floor at a place, about `surface_m` high, if the scene's camera sees it."""
     model, data = scene.model, scene.data
     geom = np.zeros((1,), np.int32)
     start = np.array([*place, ABOVE_M])
@@ -120,7 +120,7 @@ def _is_seen(scene: LiberoScene, spot: np.ndarray) -> bool:
 
 
 def _distance_m(point: np.ndarray, one: np.ndarray, other: np.ndarray) -> float:
-    """Return the distance of a point from the line between two others, (2,) each."""
+    """Return the distance of a point from the segment between two others, (2,) each."""
     along = other - one
     share = np.clip((point - one) @ along / max(float(along @ along), 1e-12), 0, 1)
     return float(np.linalg.norm(point - one - share * along))

@@ -14,7 +14,7 @@ MAX_VARIANTS = 1 << 16
 
 @dataclass(frozen=True)
 class LiberoWording(LiberoTransform):
-    """A form of words, and which of those that the form has."""
+    """A form of words, and the number of a variant of it."""
 
     form: int
     variant: int

@@ -11,7 +11,7 @@ from lerobot_env_bomb_libero.scene import LiberoScene, LiberoTransform
 
 @dataclass(frozen=True)
 class ObjectShade(LiberoTransform):
-    """The objects' colours are darker, and a little of one channel is missing."""
+    """Darker colours of the objects, with a little of one channel missing."""
 
     factors: tuple[float, float, float]  # of red, green and blue
 

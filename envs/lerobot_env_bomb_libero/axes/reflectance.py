@@ -8,13 +8,13 @@ import numpy as np
 from lerobot_bomb.libero.perturbations import libero_magnitude
 from lerobot_env_bomb_libero.scene import LiberoScene, LiberoTransform
 
-LAMPS = 3  # in a row, and rows, on a texture
+LAMPS = 3  # per row, and as many rows, on a texture
 LAMP_RADIUS = 0.28  # of the distance between two
 
 
 @dataclass(frozen=True)
 class LiberoGloss(LiberoTransform):
-    """Lamps' reflections on table and floor, drawn there: the renderer's own are weak; objects shine."""
+    """Gloss of objects, and lamps' reflections drawn on table and floor; the renderer's own are weak."""
 
     glare: float
     gloss: float
@@ -36,7 +36,7 @@ class LiberoGloss(LiberoTransform):
             part[materials] += self.gloss * (1 - part[materials])
 
     def _lit(self, pixels: np.ndarray) -> np.ndarray:
-        """(H, W, 3) uint8 -> the same; soft discs of light."""
+        """(H, W, 3) uint8 -> (H, W, 3) uint8, with soft discs of light."""
         height, width = pixels.shape[:2]
         side = min(height, width) / LAMPS  # a cube's six faces stand one below the other
         x, y = (

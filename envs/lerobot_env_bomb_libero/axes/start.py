@@ -10,16 +10,16 @@ from lerobot_bomb.libero.perturbations import libero_magnitude
 from lerobot_env_bomb_libero.scene import LiberoScene, LiberoTransform
 from lerobot_env_bomb_libero.stock import mujoco
 
-MAX_OBJECTS = 32  # directions are drawn for so many, so that a level draws what another does
+MAX_OBJECTS = 32  # directions are drawn for so many, so that all levels draw the same
 NUM_JOINTS = 7
 NUM_TRIES = 8  # directions, an eighth of a turn apart
 CLEARANCE_M = 0.02  # between what moves and everything else, at least
-REACH_M = 0.36  # from the middle of the table along x and y, that nothing is moved beyond
+REACH_M = 0.36  # from the middle of the table along x and y; nothing is moved beyond
 
 
 @dataclass(frozen=True)
 class LiberoStart(LiberoTransform):
-    """Free objects are moved, with what lies on them; the arm's joints are turned a little."""
+    """Free objects, with what lies on them, start elsewhere; the arm's joints are turned a little."""
 
     object_m: float
     directions_rad: tuple[float, ...]  # of the objects, in the order of the task's
@@ -59,7 +59,7 @@ class LiberoStart(LiberoTransform):
 
 
 def _piles(scene: LiberoScene) -> list[set[int]]:
-    """Bodies of objects and fixtures that touch, in the order of the objects; each object is in one."""
+    """Return sets of touching objects and fixtures, as bodies; each object is in one set, in their order."""
     owners = scene.owners
     things = {*scene.movable.values(), *scene.fixtures.values()}
     piles = [{body} for body in things]

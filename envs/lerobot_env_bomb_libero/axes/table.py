@@ -50,7 +50,7 @@ class SurfaceLook(LiberoTransform):
             scene.change_texture(texture, partial(self._changed, rgb=rgb))
 
     def _changed(self, pixels: np.ndarray, rgb: tuple[int, int, int]) -> np.ndarray:
-        """(H, W, 3) uint8 -> the same."""
+        """(H, W, 3) uint8 -> (H, W, 3) uint8, with colour and pattern."""
         dark = 1 - self.contrast * _pattern(self.pattern, *pixels.shape[:2])[..., None]
         mixed = (1 - self.color_share) * pixels.astype(np.float32) + self.color_share * np.array(
             rgb, np.float32

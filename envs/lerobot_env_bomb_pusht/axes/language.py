@@ -8,7 +8,7 @@ import numpy as np
 from lerobot_bomb.pusht.perturbations import pusht_magnitude
 from lerobot_env_bomb_pusht.board import PushTTransform
 
-# Forms 1 to 5; {where} is what the axis `goal` has to say of the target, else nothing.
+# Forms 1 to 5; {where} is the axis `goal`'s text on the target, else nothing.
 FORMS = (
     (  # a paraphrase
         "Please push the T-shaped block to the T-shaped target{where}.",
@@ -42,7 +42,7 @@ FORMS = (
 
 @dataclass(frozen=True)
 class PushTWording(PushTTransform):
-    """Template in place of the episode's."""
+    """Another template for the episode's instruction."""
 
     template: str
 

@@ -16,7 +16,7 @@ SHADE_RGB = ((60, 50, 50), (150, 60, 50), (170, 105, 30), (125, 60, 140), (110, 
 
 @dataclass(frozen=True)
 class BlockShade(PushTTransform):
-    """Colour in place of the block's."""
+    """Another colour of the block."""
 
     rgb: tuple[int, int, int]
 

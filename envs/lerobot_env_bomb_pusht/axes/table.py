@@ -49,7 +49,7 @@ class BoardLook(PushTTransform):
         board.background = self.draw_background
 
     def draw_background(self, screen: pygame.Surface) -> None:
-        """Cover the whole screen."""
+        """Draw board and pattern over the whole screen."""
         pattern = pattern_surface(self.pattern)
         pattern.set_palette([self.rgb, self.dark_rgb])
         screen.blit(pattern, (0, 0))

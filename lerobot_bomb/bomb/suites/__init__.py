@@ -1,4 +1,4 @@
-"""The suites: a file NAME.py here, with its `SUITE`, is the suite NAME; other packages may add some."""
+"""The suites: `SUITE` of a file NAME.py here is the suite NAME; other packages may add suites."""
 
 from pkgutil import iter_modules
 from typing import Any

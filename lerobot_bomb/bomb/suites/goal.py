@@ -38,7 +38,7 @@ def _to_tray(drawn: TaskInstance, intersections: list[Intersection]) -> tuple[Pl
 
 @dataclass(frozen=True)
 class RemoveColor(Task):
-    """The only stone of a colour goes into the tray."""
+    """Task: put the only stone of a colour into the tray."""
 
     def draw(self, rng: np.random.Generator) -> TaskInstance:
         return TaskInstance(
@@ -57,7 +57,7 @@ class RemoveColor(Task):
 
 @dataclass(frozen=True)
 class RemoveAt(Task):
-    """The stone on an intersection goes into the tray."""
+    """Task: put the stone on an intersection into the tray."""
 
     def draw(self, rng: np.random.Generator) -> TaskInstance:
         row, column = INTERSECTIONS[rng.integers(len(INTERSECTIONS))]
@@ -88,7 +88,7 @@ class Swap(Task):
             return None
         if not is_graspable(stones, a) or not is_graspable(stones, b):
             return None
-        # the free ones of them
+        # of these, only free ones can hold a stone
         others = [intersection for intersection in INTERSECTIONS if intersection not in (a, b)]
         first, second = drawn.stone_on(a), drawn.stone_on(b)
         plans = tuple(
@@ -96,7 +96,7 @@ class Swap(Task):
             for one, other, here, there in ((first, second, a, b), (second, first, b, a))
         )
         aims = (Aim(first, TRAY_XY_M[0]), aim_at(second, a), aim_at(first, b))
-        # with their colours, for when it is done is seen by them alone
+        # with their colours: they alone show when the swap is done
         command = (
             f"swap the {stones[a]} stone at row {a[0]}, column {a[1]} and the {stones[b]} stone at "
             f"row {b[0]}, column {b[1]}"
@@ -106,7 +106,7 @@ class Swap(Task):
 
 @dataclass(frozen=True)
 class Push(Task):
-    """The only stone of a colour goes one intersection further, without being lifted."""
+    """Task: push the only stone of a colour one intersection further, without lifting it."""
 
     direction: str
     rows: int
@@ -130,7 +130,7 @@ class Push(Task):
             return None
         stone = drawn.stone_on(intersection)
         plan = (Move(frozenset([stone]), frozenset([place]), is_slid=True),)
-        # with the place, for a stone that has been pushed half the way does not show where it stood
+        # with the place: a stone that has been pushed half the way does not show where it stood
         command = (
             f"push the {color} stone one intersection {self.direction}, to row {place[0]}, "
             f"column {place[1]}, along the board and without lifting it"
@@ -159,7 +159,7 @@ class ClearRow(Task):
 
 @dataclass(frozen=True)
 class Gather(Task):
-    """Task: move all stones of a colour that do not stand on the left to the left."""
+    """Task: move all stones of a colour to the left, unless they stand there."""
 
     def draw(self, rng: np.random.Generator) -> TaskInstance:
         return TaskInstance(

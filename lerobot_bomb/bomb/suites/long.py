@@ -34,14 +34,14 @@ def _in_turn(first: int, number: int) -> tuple[str, ...]:
 
 
 def _shuffled(rng: np.random.Generator, colors: tuple[str, ...]) -> tuple[str, ...]:
-    """The stones of the tray, row by row: any order of these colours."""
+    """Draw an order of these colours: the stones of the tray, row by row."""
     return tuple(colors[i] for i in rng.permutation(len(colors)))
 
 
 def _supply_plan(
     drawn: TaskInstance, moves: list[tuple[str, Intersection]], is_ordered: bool
 ) -> tuple[Plan, tuple[Aim, ...]]:
-    """Stones of these colours from the tray to these intersections; any stone of the colour will do.
+    """Plan moves of stones from the tray to these intersections; any stone of the colour will do.
 
     The expert takes the first of them in the tray, row by row from the far one.
     """
@@ -58,7 +58,7 @@ def _supply_plan(
 
 @dataclass(frozen=True)
 class Opening(Task):
-    """Stones from the tray are played in turn, from one instruction or one at a time."""
+    """Task: play stones from the tray, colours in turn, from one instruction or from one for each move."""
 
     num_moves: int
     is_by_turns: bool
@@ -142,7 +142,7 @@ class FillRow(Task):
 
 @dataclass(frozen=True)
 class Capture(Task):
-    """The last liberty of a group is taken, and its stones go into the tray."""
+    """Task: take the last liberty of a group, and put its stones into the tray."""
 
     size: int
 
@@ -203,7 +203,7 @@ class Capture(Task):
 
 @dataclass(frozen=True)
 class TakeBack(Task):
-    """The last two moves are undone, the later one first."""
+    """Task: undo the last two moves, the later one first."""
 
     def draw(self, rng: np.random.Generator) -> TaskInstance:
         stones = draw_stones(rng, int(rng.integers(2, 7)))
@@ -261,6 +261,6 @@ TASKS: tuple[Task, ...] = (
     TakeBack(),
     *(CopyPattern(number) for number in (2, 3, 4)),
 )
-# 1.1: of equal stones the expert takes the first in the tray, it copies row by row and waits for what has not
-# been said; a row is filled up to the last one's colour
+# 1.1: of equal stones the expert takes the first in the tray; it copies row by row, and waits for moves that
+# no instruction has named yet; a row is filled up to the last stone's colour
 SUITE = command_suite(TASKS, max_steps=440, num_goals=MAX_MOVES, version="1.1")

@@ -16,13 +16,13 @@ from lerobot_bomb.bomb.suites.place import ALL_TARGETS, sample_opening
 
 MAX_OPENING_STONES = 5
 MIN_SUPPLY, MAX_SUPPLY = 2, 4
-# Each stone of the supply lies in a corner of a rectangle around the tray's centre, somewhere in these ranges
-# from it: fingers fit between two stones, and the axis `start` keeps them all on the tray.
+# Each stone of the supply lies in a corner of a rectangle around the tray's centre, at distances
+# in these ranges: fingers fit between two stones, and the axis `start` keeps them all on the tray.
 CORNER_X_M = (0.023, 0.030)
 CORNER_Y_M = (0.023, 0.026)
 GRIPPER_START_SPREAD_M = 0.030  # of the gripper around the tray's centre, in x and in y
 GRIPPER_START_HEIGHT_M = (0.08, 0.11)
-# by which the stone that is meant is nearer, further left, ... than any other: it is seen at 64 pixels
+# how much nearer, further left, ... the stone that is meant is than any other; visible at 64 pixels
 MARGIN_M = 0.012
 
 TEMPLATES = (
@@ -69,7 +69,7 @@ class Supply:
 
 @dataclass(frozen=True)
 class StoneTask:
-    """Task about one stone in the tray: `select` returns its index, None where it is not clear which."""
+    """Task about one stone in the tray: `select` returns its index, None if it is unclear which."""
 
     stone: str
     select: Callable[[Supply], int | None]
@@ -144,7 +144,7 @@ def _pairs(spec: EpisodeSpec) -> list[tuple[int, Intersection]]:
 
 
 def _check(spec: EpisodeSpec) -> None:
-    """Raise a ValueError, which names the flag, unless there is an episode of the spec."""
+    """Raise a ValueError that names the flag unless the spec has an episode."""
     refuse_options(spec, "color")
     if not _pairs(spec):
         raise ValueError(
@@ -154,7 +154,7 @@ def _check(spec: EpisodeSpec) -> None:
 
 
 def _sample_episode(spec: EpisodeSpec) -> Episode:
-    """Draw task, target, supply, opening and start; the same spec, the same episode."""
+    """Draw task, target, supply, opening and start; the same spec gives the same episode."""
     _check(spec)
     pairs = _pairs(spec)
     task_id, target = pairs[generator(spec.seed, Stream.TARGET).integers(len(pairs))]
@@ -181,7 +181,7 @@ def _sample_episode(spec: EpisodeSpec) -> Episode:
 
 
 def _sample_supply(rng: np.random.Generator, task: StoneTask) -> tuple[Supply, int, float]:
-    """Stones, gripper and the index of the only stone that is meant; the gripper's height in metres."""
+    """Draw the supply; return it, the index of the stone that is meant and the gripper's height in metres."""
     height_m = rng.uniform(*GRIPPER_START_HEIGHT_M)
     corners = np.array([(x, y) for x in (-1, 1) for y in (-1, 1)])
     while True:

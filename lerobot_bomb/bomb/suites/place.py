@@ -70,7 +70,7 @@ def targets_of(split: str) -> tuple[Intersection, ...]:
 
 
 def check_target(spec: EpisodeSpec) -> None:
-    """Raise a ValueError if the spec names a target of another split."""
+    """Raise a ValueError if the spec gives a `task_id`, or a target of another split."""
     if spec.task_id is not None:
         raise ValueError("suite 'place' names its tasks by target and colour, not by task_id")
     if spec.target is not None and tuple(spec.target) not in targets_of(spec.split):
@@ -81,7 +81,7 @@ def check_target(spec: EpisodeSpec) -> None:
 
 
 def _sample_episode(spec: EpisodeSpec) -> Episode:
-    """Draw target, colour, instruction, opening and start; the same spec, the same episode."""
+    """Draw target, colour, instruction, opening and start; the same spec gives the same episode."""
     check_target(spec)
     targets = targets_of(spec.split)
     drawn_target = targets[generator(spec.seed, Stream.TARGET).integers(len(targets))]
@@ -105,7 +105,7 @@ def _sample_episode(spec: EpisodeSpec) -> Episode:
 
 
 def of_task(spec: EpisodeSpec, number: int) -> EpisodeSpec:
-    """The spec with target and colour of a numbered task: 25 x colour + 5 x row + column."""
+    """Return the spec with target and colour of a numbered task: 25 x colour + 5 x row + column."""
     if spec.target is not None or spec.color is not None:
         raise ValueError("--env.task_ids fixes targets and colours; drop --env.target and --env.color")
     color, point = divmod(number, BOARD.num_lines**2)
@@ -113,7 +113,7 @@ def of_task(spec: EpisodeSpec, number: int) -> EpisodeSpec:
 
 
 def layout_of_one(seed: int, color: str) -> Layout:
-    """One stone in the tray, near the gripper, and an empty board."""
+    """Draw one stone in the tray, near the gripper; the board is empty."""
     gripper, start = generator(seed, Stream.GRIPPER), generator(seed, Stream.START)
     gripper_xyz = np.array([*TRAY_CENTER_XY, 0.0])
     gripper_xyz[:2] += gripper.uniform(-GRIPPER_START_SPREAD_M, GRIPPER_START_SPREAD_M, 2)
@@ -136,7 +136,7 @@ def sample_opening(
     max_stones: int,
     colors: Sequence[str] = COLORS,
 ) -> dict[Intersection, str]:
-    """{(row, column): colour} of up to this many stones, colours in turn; position and move are legal.
+    """{(row, column): colour} of up to `max_stones` stones, colours in turn; position and move are legal.
 
     The candidates do not depend on the move, and the first that allows it is taken. So the stones on the
     board reveal nothing about the target but that it is free and legal.

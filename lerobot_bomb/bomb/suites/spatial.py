@@ -116,7 +116,7 @@ class Between(PlaceTask):
 
 @dataclass(frozen=True)
 class Fixed(PlaceTask):
-    """A place that the board itself has."""
+    """Task: a fixed place of the board."""
 
     place: str
     intersection: Intersection
@@ -131,7 +131,7 @@ class Fixed(PlaceTask):
 
 @dataclass(frozen=True)
 class Gap(PlaceTask):
-    """The only free intersection of a row; every other row has none or several."""
+    """Task: the only free intersection of a row; every other row has none or several."""
 
     place: str
     has_anchor = False
@@ -176,7 +176,7 @@ def _is_heldout(task_id: int, target: Intersection, color: str) -> bool:
 
 @cache
 def cases_of_split(split: str) -> tuple[tuple[int, Intersection, str], ...]:
-    """(task, target, colour of the stone to be moved) that a split draws from."""
+    """Return the cases (task, target, colour of the stone to be moved) that a split draws from."""
     cases = [
         (task_id, target, color)
         for task_id in range(len(TASKS))
@@ -187,7 +187,7 @@ def cases_of_split(split: str) -> tuple[tuple[int, Intersection, str], ...]:
 
 
 def _cases(spec: EpisodeSpec) -> dict[int, list[tuple[Intersection, str]]]:
-    """{task: targets and colours} that a spec draws from."""
+    """Return the cases {task: targets and colours} that a spec draws from."""
     cases: dict[int, list[tuple[Intersection, str]]] = {}
     for task_id, target, color in cases_of_split(spec.split):
         if spec.task_id in (None, task_id) and spec.color in (None, color):
@@ -196,7 +196,7 @@ def _cases(spec: EpisodeSpec) -> dict[int, list[tuple[Intersection, str]]]:
 
 
 def _check(spec: EpisodeSpec) -> None:
-    """Raise a ValueError, which names the flag, unless there is an episode of the spec."""
+    """Raise a ValueError that names the flag unless the spec has an episode."""
     refuse_options(spec, "target")
     if not _cases(spec):
         raise ValueError(
@@ -206,7 +206,7 @@ def _check(spec: EpisodeSpec) -> None:
 
 
 def _sample_episode(spec: EpisodeSpec) -> Episode:
-    """Draw task, target, colour, opening and start; the same spec, the same episode."""
+    """Draw task, target, colour, opening and start; the same spec gives the same episode."""
     _check(spec)
     cases = _cases(spec)
     rng = generator(spec.seed, Stream.TARGET)
@@ -245,7 +245,7 @@ def _sample_opening(
     anchor: str,
     extra_colors: tuple[str, ...],
 ) -> dict[Intersection, str]:
-    """Draw up to 8 stones with which the move is legal and the only one that is meant."""
+    """Draw up to 8 stones with which the move is legal and the instruction clear."""
     while True:
         ways = task.referents(target)
         intersections = ways[rng.integers(len(ways))]

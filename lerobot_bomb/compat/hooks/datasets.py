@@ -15,7 +15,7 @@ from lerobot_bomb.compat.hooks.replace import replace
 def read_asked_columns() -> None:
     """Let LeRobot read only the requested columns of a sample's other frames, not their images.
 
-    A chunk of 16 actions decodes the images of all its 16 frames otherwise, and throws them away.
+    Otherwise a chunk of 16 actions decodes the images of all its 16 frames, and throws them away.
     """
 
     def around(usual: Callable[..., dict[str, Any]]) -> Callable[..., dict[str, Any]]:
@@ -48,7 +48,7 @@ def explain_missing_datasets(explain: Callable[[str, Path, Exception], str]) -> 
         def load(self: LeRobotDatasetMetadata, *args: Any, **kwargs: Any) -> None:
             try:
                 usual(self, *args, **kwargs)
-            except ValueError:  # of what was given
+            except ValueError:  # the arguments are wrong
                 raise
             except Exception as error:
                 root = getattr(self, "root", None)

@@ -54,9 +54,9 @@ def tell_config_errors(
 def tell_refusals() -> None:
     """Let LeRobot's commands end in one line where our code refuses something, or with Ctrl-C.
 
-    Such an error says what to do, and a traceback above it would hide that. With
-    LEROBOT_BOMB_TRACEBACK=1 it is shown. So is a DecodingError told: lerobot-train reads a checkpoint's
-    config after its parser, which would print it.
+    Such an error says what to do, and a traceback would hide that; LEROBOT_BOMB_TRACEBACK=1 shows it. A
+    DecodingError is one line, too: lerobot-train reads a checkpoint's config after its parser, which would
+    print it so.
     """
     command, usual = Path(sys.argv[0]).stem.replace("_", "-"), sys.excepthook
     if not command.startswith("lerobot-") or os.environ.get(SHOW_TRACEBACK):

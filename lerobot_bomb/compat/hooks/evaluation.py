@@ -16,7 +16,7 @@ BEGIN = "begin_evaluation"  # method of our vector environments
 def check_evaluations(check: Callable[[Any], None]) -> None:
     """Let `check` see each EvalPipelineConfig that is made with an environment of ours.
 
-    An environment is told nothing of LeRobot's --eval flags but the number of copies.
+    LeRobot tells an environment nothing of its --eval flags but the number of copies.
     """
     from lerobot.configs.eval import EvalPipelineConfig  # imports environments and policies
 
@@ -32,9 +32,9 @@ def check_evaluations(check: Callable[[Any], None]) -> None:
 
 
 def run_tasks_in_turn(is_needed: Callable[[Any], bool]) -> None:
-    """Let LeRobot's evaluation of such a policy use no threads, whatever --env.max_parallel_tasks says.
+    """Let LeRobot evaluate without threads, whatever --env.max_parallel_tasks says, if `is_needed(policy)`.
 
-    They would share its queue of actions. Commands that are imported later than this keep the original.
+    Threads would share the policy's queue of actions. Commands that are imported later keep the original.
     """
 
     def around(usual: Callable[..., Any]) -> Callable[..., Any]:
@@ -57,8 +57,8 @@ def run_tasks_in_turn(is_needed: Callable[[Any], bool]) -> None:
 def tell_of_evaluations() -> None:
     """Let LeRobot's evaluation tell an environment how many episodes it counts, and film each to its end.
 
-    It cuts a video's last image off, which names the outcome, for it has taken one of the start beside one of
-    each step. Both are for environments with `begin_evaluation`; the others are evaluated as ever.
+    LeRobot films the start and each step, and then cuts off the last image, which names the outcome. Both are
+    for environments with `begin_evaluation`; others are evaluated as ever.
     """
 
     def telling(usual: Callable[..., Any]) -> Callable[..., Any]:
@@ -85,7 +85,7 @@ def tell_of_evaluations() -> None:
 
 
 def _but_first(call: Callable[[Any], None]) -> Callable[[Any], None]:
-    """Return a function that does nothing when it is called first."""
+    """Return `call` as a function whose first call does nothing."""
     is_first = True
 
     def later(argument: Any) -> None:
@@ -98,7 +98,7 @@ def _but_first(call: Callable[[Any], None]) -> Callable[[Any], None]:
 
 
 def _loaded_with(name: str) -> Iterator[ModuleType]:
-    """Yield the modules of LeRobot's commands that evaluate, those which are loaded and hold a function."""
+    """Yield the loaded modules of LeRobot's evaluating commands that hold a function of this name."""
     names = ("lerobot.scripts.lerobot_eval", "lerobot.scripts.lerobot_train", "__main__")
     for module in map(sys.modules.get, names):
         if module is not None and hasattr(module, name):

@@ -42,7 +42,7 @@ def tell_wrong_flags(
         def decode_dataclass(*args: Any, **kwargs: Any) -> Any:
             cls, values, *path = signature(usual).bind(*args, **kwargs).arguments.values()
             kind = get_origin(cls) or cls
-            # without a path they are of a checkpoint's file
+            # without a path the values are of a checkpoint's file
             if path and path[0] and isinstance(values, dict) and is_ours(kind):
                 names = [each.name for each in fields(kind)]
                 unknown = [name for name in values if name not in names]

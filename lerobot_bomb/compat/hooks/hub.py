@@ -28,9 +28,9 @@ def check_tokens_before_use(check: Callable[[str], None]) -> None:
 
 
 def publish_as_the_policy_says() -> None:
-    """Let lerobot-train publish a policy of ours by its `push_model_to_hub`, which LeRobot 0.6.1 itself asks.
+    """Let lerobot-train publish a policy of ours by its `push_model_to_hub`, as LeRobot 0.6.1 does.
 
-    0.6.2 uploads in four commits with a card of its own, and asks the policy no more. All processes call it.
+    0.6.2 uploads four commits with a card of its own, and does not call the method. All processes call it.
     """
     from lerobot.common import train_utils
 

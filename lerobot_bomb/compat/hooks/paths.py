@@ -19,10 +19,10 @@ from lerobot_bomb.compat.use import is_ours, use
 def resolve_checkpoints(prefix: str, resolve: Callable[[str], str]) -> None:
     """Let `resolve` change `--policy.path` of LeRobot's commands and config files.
 
-    Other paths than `prefix...` stay as they are. Its ValueError ends the command in one line.
+    Only paths that start with `prefix` change. A ValueError of `resolve` ends the command in one line.
 
-    LeRobot's commands ask for a path before they read any other flag. Where these name a type of ours, the
-    other hooks are installed, so that wrong flags are told, too.
+    LeRobot's commands ask for a path before they read any other flag. If flags name a type of ours, the
+    other hooks are installed, so that wrong flags are reported, too.
     """
 
     def around(usual: Callable[..., str | None]) -> Callable[..., str | None]:

@@ -18,8 +18,8 @@ _WRAPPED: WeakSet[Callable[..., Any]] = WeakSet()  # by `wrap_select_action`
 def remember_policies() -> None:
     """Let `built_policies` know every policy that this process builds, LeRobot's own types too.
 
-    `lerobot-eval` and `lerobot-train` build it before the first reset of an environment. Those that were
-    built before this call are known by the garbage collector.
+    `lerobot-eval` and `lerobot-train` build theirs before the first reset of an environment. The garbage
+    collector knows those that were built before this call.
     """
 
     def around(usual: Callable[..., None]) -> Callable[..., None]:
@@ -35,7 +35,7 @@ def remember_policies() -> None:
 
 
 def _living_policies() -> list[PreTrainedPolicy]:
-    """Return the policies that the garbage collector knows, oldest first, about."""
+    """Return the policies that the garbage collector knows, roughly oldest first."""
     # a collection between two of these calls would move a policy to a generation that was already read
     was_enabled = gc.isenabled()
     gc.disable()
@@ -52,7 +52,7 @@ def _living_policies() -> list[PreTrainedPolicy]:
 
 
 def built_policies() -> list[PreTrainedPolicy]:
-    """The policies that this process built and still holds, in that order.
+    """Return the policies that this process built and still holds, oldest first.
 
     `config.pretrained_path` and `config.pretrained_revision` say where one was loaded from.
     """
@@ -65,7 +65,7 @@ def training_data(config: PreTrainedConfig) -> LeRobotDatasetMetadata | None:
 
 
 def wrap_select_action(policy: PreTrainedPolicy, around: Callable[[Callable], Callable]) -> None:
-    """Let the `select_action` of a policy's class be `around(it)`; a second call changes nothing.
+    """Replace the `select_action` of a policy's class by `around(it)`; a second call changes nothing.
 
     Adapters call the class's method on the policy that they wrap.
     """

@@ -18,10 +18,10 @@ def check_processors_before_use(
     check: Callable[[dict[str, Any], str, Path], Any],
     check_loaded: Callable[[Sequence[Any], str, Path], None],
 ) -> None:
-    """Let LeRobot's loader build no step of a saved processor before `check(its JSON, where, config.json)`.
+    """Have saved processors checked before LeRobot's loader builds their steps, and again once loaded.
 
-    Here what is checked is what will be built. Then `check_loaded(steps, where, config.json)`. From the Hub,
-    states and config.json, which there may not be, are of the commit that the JSON is of.
+    First `check(its JSON, where, config.json)` sees what will be built, then `check_loaded(steps, where,
+    config.json)`. From the Hub, states and config.json, which may be missing, are of the JSON's commit.
     """
 
     def around(usual: Callable[..., Any]) -> Callable[..., Any]:

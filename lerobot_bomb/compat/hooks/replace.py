@@ -11,10 +11,10 @@ ORIGINAL = "_before_lerobot_bomb"
 def replace(owner: Any, name: str, around: Callable[[Callable], Callable]) -> None:
     """Put `around(original)` in the place of a function or method; doing it again changes nothing more.
 
-    Of a class method, the original takes the class first.
+    The original of a class method takes the class first.
 
     Raises:
-        RuntimeError: this version of LeRobot has none of that name; nothing may go on without the hook.
+        RuntimeError: this version of LeRobot has nothing of that name; nothing may go on without the hook.
     """
     try:
         held = inspect.getattr_static(owner, name)

@@ -22,10 +22,10 @@ def lerobot_eval_with(flags: Sequence[str], wrap: Callable[[Any, Any], Any]) -> 
 
 
 class KeptPolicy:
-    """Runs lerobot-eval several times in one process; a policy stays as long as the same one is asked for.
+    """Runs lerobot-eval several times in one process; keeps a policy as long as the same one is requested.
 
-    Random numbers restart from their state after the policy was built, so an evaluation gives the same as in
-    a process of its own.
+    Random numbers restart from their state after the policy was built, so an evaluation gives the same
+    results as in a process of its own.
     """
 
     def __init__(self) -> None:
@@ -38,8 +38,8 @@ class KeptPolicy:
     def evaluate(self, flags: Sequence[str], asked: object, first: int = 0) -> None:
         """Run lerobot-eval, which draws no video and runs one task after another.
 
-        `asked` is equal if it needs the previous policy, built with the same seed. `first` is the number
-        of an episode that is run alone out of a longer evaluation.
+        An equal `asked` reuses the previous policy, built with the same seed. `first` is the number of an
+        episode that is run alone out of a longer evaluation.
         """
         from lerobot.scripts import lerobot_eval
         from lerobot.utils.random_utils import get_rng_state, set_rng_state
@@ -76,7 +76,7 @@ class KeptPolicy:
 
 
 def _refuse_not_finite(env: Any) -> None:
-    """Let a vector env raise an ArithmeticError for such an action; LeRobot's own may end the process."""
+    """Let a vector env raise an ArithmeticError for a non-finite action; LeRobot's may end the process."""
     step = env.step
 
     def checked(actions: np.ndarray) -> Any:
@@ -88,16 +88,16 @@ def _refuse_not_finite(env: Any) -> None:
 
 
 def _start_with(env: Any, number: int) -> None:
-    """Let LeRobot's LIBERO start in the initial state of this number; it takes the first, then the next."""
+    """Let LeRobot's LIBERO start in the initial state of this number; by itself it begins with the first."""
     if any(hasattr(each.unwrapped, "init_state_id") for each in getattr(env, "envs", ())):
         env.set_attr("init_state_id", [number + row for row in range(env.num_envs)])
 
 
 def eval_config(flags: Sequence[str]) -> Any:
-    """LeRobot's EvalPipelineConfig, as lerobot-eval reads it from these flags.
+    """Read LeRobot's EvalPipelineConfig from flags, as lerobot-eval does.
 
     Raises:
-        SystemExit: the flags are wrong; its parser has said why.
+        SystemExit: the flags are wrong; LeRobot's parser has said why.
     """
     from lerobot.configs import parser
     from lerobot.configs.eval import EvalPipelineConfig
@@ -113,7 +113,7 @@ def eval_config(flags: Sequence[str]) -> Any:
 
 
 def _run_lerobot_eval(flags: Sequence[str], **replaced: Any) -> None:
-    """Run lerobot-eval in this process, with other functions of these names."""
+    """Run lerobot-eval in this process, with functions of it replaced by name."""
     from lerobot.scripts import lerobot_eval
 
     usual = {name: getattr(lerobot_eval, name) for name in replaced}
@@ -129,7 +129,7 @@ def _run_lerobot_eval(flags: Sequence[str], **replaced: Any) -> None:
 
 @contextmanager
 def _argv(command: str, flags: Sequence[str]) -> Iterator[None]:
-    """LeRobot's parser reads it in several places."""
+    """Set sys.argv, which LeRobot's parser reads in several places."""
     usual, sys.argv = sys.argv, [command, *flags]
     try:
         yield

@@ -52,7 +52,7 @@ class _Tables:
         concatenate: bool = True,
         **options: Any,
     ) -> tuple[Any, tuple[int, int]]:
-        """Stand for LeRobot's function of this name; it decides by the sizes of what it appends."""
+        """Stand in for `append_or_create_parquet_file`; the sizes of its sources decide when a file ends."""
         size_mb = get_parquet_file_size_in_mb(src_path)
         table = self._open.get(default_path)
         if table and (not concatenate or table.size_mb + size_mb >= max_mb):
@@ -96,7 +96,7 @@ class _Videos:
         self._sizes_mb: dict[Path, float] = {}
 
     def append(self, input_video_paths: list[Path], output_video_path: Path, **_: Any) -> None:
-        """Stand for LeRobot's function, which joins what there is with the next one."""
+        """Stand in for `concatenate_video_files`, which joins an existing video with the next one."""
         there, following = input_video_paths
         size_mb = self.size_mb(there) + self.size_mb(following)
         self._joined.setdefault(output_video_path, [there]).append(following)

@@ -28,7 +28,7 @@ def sample_pixels(image: np.ndarray) -> np.ndarray:
 def sampled_image_statistics() -> Iterator[None]:
     """Let LeRobot's video encoder take image statistics from a sample of the pixels.
 
-    It samples so itself from 300 pixels on; all pixels of a 256x256 frame cost 5 ms of one core.
+    LeRobot itself samples only from 300 pixels on; all pixels of a 256x256 frame cost 5 ms of one core.
     """
     usual = compute_stats.auto_downsample_height_width
     compute_stats.auto_downsample_height_width = sample_pixels
@@ -42,7 +42,7 @@ def sampled_image_statistics() -> Iterator[None]:
 def without_statistics(keys: Collection[str]) -> Iterator[None]:
     """Let LeRobot write no statistics of these features, and so normalise none of them.
 
-    It would take them of every pixel apart: gigabytes of histograms for one depth image.
+    It would take them for each pixel: gigabytes of histograms for one depth image.
     """
     usual = dataset_writer.compute_episode_stats
 
@@ -57,7 +57,7 @@ def without_statistics(keys: Collection[str]) -> Iterator[None]:
 
 
 def embed_in_batches(dataset: Dataset) -> Dataset:
-    """Put the bytes of image files into a table."""
+    """Put the bytes of image files into a dataset's table, in batches."""
     shown_as = dataset.format
     return dataset.with_format("arrow").map(embed_table_storage, batched=True).with_format(**shown_as)
 
@@ -77,7 +77,7 @@ def batched_embedding() -> Iterator[None]:
 def mergeable_arrays(features: dict[str, dict]) -> Iterator[None]:
     """Let LeRobot merge tables that hold arrays of two dimensions.
 
-    If they hold images, it names their types itself; otherwise pyarrow must guess them.
+    LeRobot names the types of tables that hold images; for others pyarrow must guess them.
     """
     usual = aggregate.to_parquet_one_row_group_per_episode
     types = get_hf_features_from_features(features | DEFAULT_FEATURES)
@@ -89,9 +89,9 @@ def mergeable_arrays(features: dict[str, dict]) -> Iterator[None]:
 
 
 def abandon(dataset: LeRobotDataset) -> None:
-    """End the threads of a dataset that is being written, and let none of it be written later.
+    """End the threads of an unfinished dataset, and let nothing of it be written later.
 
-    When it is garbage collected, LeRobot would write its table of episodes, and make the folder for it anew.
+    At garbage collection, LeRobot would write its table of episodes, and make the folder for it anew.
     """
     dataset.clear_episode_buffer()
     dataset.meta._finalized = True

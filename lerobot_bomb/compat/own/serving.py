@@ -11,13 +11,13 @@ from typing import Any
 def serve_registered_policies(
     config: Any, address: str, loads: Callable[[bytes], Any], interceptor: Any, workers: int
 ) -> Any:
-    """Start LeRobot's policy server, a PolicyServerConfig's, for every registered policy type.
+    """Start LeRobot's policy server for every registered policy type; return gRPC's server.
 
-    Its own knows a list of LeRobot's types, imports no plugins, unpickles whatever it receives, and four
-    requests that never end stop it. Returns gRPC's server.
+    LeRobot's command knows a list of its types, imports no plugins, unpickles whatever it receives, and four
+    requests that never end stop it. `config` is a PolicyServerConfig.
 
     Raises:
-        ValueError: the address cannot be had.
+        ValueError: the server cannot listen on the address.
     """
     import grpc
     from lerobot.async_inference import policy_server
