@@ -15,7 +15,7 @@ def masked_mean_pool(states_BTR: Tensor, mask_BT: Tensor) -> Tensor:
 
 
 def modulate(features_BKH: Tensor, gamma_B1H: Tensor, beta_B1H: Tensor) -> Tensor:
-    """Features scaled and shifted, (B, K, H)."""
+    """Scale and shift features (B, K, H)."""
     return gamma_B1H * features_BKH + beta_B1H
 
 
@@ -37,7 +37,7 @@ class FiLM(nn.Module):
         )
 
     def coefficients(self, pooled_BR: Tensor) -> tuple[Tensor, Tensor]:
-        """Gamma and beta, (B, 1, H) each."""
+        """Return gamma and beta, (B, 1, H) each."""
         gamma_B1H, beta_B1H = self.layers(pooled_BR)[:, None].chunk(2, dim=-1)
         return gamma_B1H, beta_B1H
 
