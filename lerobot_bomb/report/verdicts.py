@@ -1,6 +1,6 @@
 """Verdicts over records: ways in which a success rate can be wrong, question by question.
 
-Groups are lists of records of the same episodes, but for those of the splits.
+Groups hold records of the same episodes, except those of the splits.
 """
 
 from collections.abc import Mapping, Sequence
