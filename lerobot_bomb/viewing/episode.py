@@ -41,7 +41,7 @@ class Viewed:
 
     @property
     def log(self) -> "type[EpisodeLog]":
-        """The class that writes its recording."""
+        """Class that writes its recording."""
         return resolve_name(self.log_at)
 
     def name(self, policy: str) -> str:
@@ -57,11 +57,11 @@ class EnvView(ABC):
 
     @abstractmethod
     def of_flags(self, flags: Mapping[str, Any]) -> Viewed:
-        """Return the episode of seed, perturbations, image_size and own flags; None if not given."""
+        """Return the episode of seed, perturbations, image_size and own flags, None if not given."""
 
     @abstractmethod
     def of_record(self, record: Any, spec: Any, depth: bool) -> Viewed:
-        """Return a spec's episode as a record's was shown, with depth if the policy saw it."""
+        """Return a spec's episode, shown like a record's, with depth if the policy saw it."""
 
 
 @dataclass(frozen=True)
