@@ -73,7 +73,7 @@ VISION_500M = {
 
 
 def main() -> None:
-    """Time both and print the tables; exit with code 1 if a bar is missed."""
+    """Time decoding and a policy, print the tables; exit with code 1 if a bar is missed."""
     parser = make_parser(__doc__)
     parser.add_argument("--repeats", type=positive, default=10, help="answers of each (default: 10)")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="default: all")
@@ -214,7 +214,7 @@ def time_policy(repeats: int) -> Rows:
 
 
 def make_policy(compiled: bool) -> Vla0SmolPolicy:
-    """Make a policy of this shape, with random weights."""
+    """Make a policy of the 500M shape, with random weights."""
     config = Vla0SmolConfig(
         vlm_config=config_500m(),
         prompt_tokens=PromptTokens.from_tokenizer(load_tokenizer(NANO), NANO).to_dict(),

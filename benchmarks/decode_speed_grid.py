@@ -48,7 +48,7 @@ IMAGE_SIZE = 128
 
 
 def main() -> None:
-    """Time both and print the tables; exit with code 1 if a bar is missed."""
+    """Time the policy and the peer, print the tables; exit with code 1 if a bar is missed."""
     parser = make_parser(__doc__)
     add_episode_arguments(parser, "spatialvla_grid")
     parser.add_argument("--repeats", type=positive, default=20, help="answers of each (default: 20)")

@@ -46,7 +46,7 @@ class Seconds:
     cpu: float
 
     def on(self, device: str) -> float:
-        """Return the seconds that are made equal on a device."""
+        """Return the seconds that count on a device: of CPU on a CPU, else by the clock."""
         return self.cpu if device == "cpu" else self.clock
 
 

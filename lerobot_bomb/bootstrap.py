@@ -110,8 +110,8 @@ def _least_squares(moments: np.ndarray) -> np.ndarray:
 def variance_share(values_N: np.ndarray, levels_N: np.ndarray) -> float | None:
     """Share of the values' variance that the level alone explains: its first-order sensitivity index.
 
-    Corrected for the number of levels, so that it is 0 on average where the level has no effect, and can be
-    negative. None if it is undefined: all values or all levels are the same.
+    It is corrected for the number of levels, so it is 0 on average where the level has no effect, and can be
+    negative. None if undefined: all values or all levels are the same.
     Source: epsilon squared, Kelley (1935), "An unbiased correlation ratio measure".
     """
     total = float(((values_N - values_N.mean()) ** 2).sum())

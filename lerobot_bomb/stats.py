@@ -110,7 +110,7 @@ def format_rate(successes: int, n: int) -> str:
 def mcnemar_p_value(only_first: int, only_second: int) -> float:
     """Two-sided exact p-value of the hypothesis that both groups of paired episodes succeed equally often.
 
-    Given that one of a pair alone succeeded, it is either with probability 1/2 (McNemar, 1947).
+    In a pair with a single success, either group has it with probability 1/2 (McNemar, 1947).
     """
     from scipy.special import bdtr
 

@@ -23,7 +23,7 @@ class FiLM(nn.Module):
     """gamma * h + beta, with gamma and beta (B, H) from pooled states (B, R), the same for all action steps.
 
     Feature-wise linear modulation (Perez et al. 2017, arXiv 1709.07871); DualMod has one for each head.
-    Exactly the identity before training.
+    It is exactly the identity before training.
     """
 
     def __init__(self, state_size: int, dualmod_dim: int, head_dim: int):

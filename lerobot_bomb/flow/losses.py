@@ -92,7 +92,7 @@ def energy_noise(
 ) -> Tensor:
     """(1 - tau) J^T eps with J the Jacobian of eps by A^tau, (B, K, D); the noise itself if it is eps*.
 
-    The latter holds only for a point mass of clean actions: then eps* = (A^tau - tau A0) / (1 - tau). It is
+    The latter holds only for a point mass of clean actions: then eps* = (A^tau - tau A0) / (1 - tau). This is
     the sound reading of FDVLA's equation 6: the gradient of an energy |eps|^2 / 2, here within the loss mask.
     ``noise_BKD`` must have been computed from ``point.actions``, which ``requires_grad``. ``differentiable``:
     whether the result can be trained through, by a second backward pass that fused attention lacks.
@@ -166,7 +166,7 @@ def joint_loss(
 
 @contextmanager
 def second_derivatives(enabled: bool) -> Iterator[None]:
-    """Use attention that can be differentiated twice, unlike its fused kernels."""
+    """If enabled, use attention that can be differentiated twice, unlike its fused kernels."""
     if not enabled:
         yield
         return

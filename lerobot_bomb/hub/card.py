@@ -178,7 +178,7 @@ class Checkpoint:
         return text + f"\n\n`{SUITE}` is that of its training, which the dataset does not say." * is_open
 
     def _eval_flags(self) -> list[str] | None:
-        """Return the flags of the environment that it was trained for, or evaluated in; None if unknown."""
+        """Return the flags of the environment of the training, or else of the results; None if unknown."""
         knows_suite = self.environment is not None and self.environment.task is not None
         if self.environment is not None and (knows_suite or not self.results):
             return self.environment.eval_flags()

@@ -35,7 +35,7 @@ def read_dataset(root: Path, repo_id: str) -> RecordedDataset:
     """Read and check the dataset in a folder.
 
     Raises:
-        ValueError: it is damaged, or lerobot-bomb did not write it.
+        ValueError: the dataset is damaged, or lerobot-bomb did not write it.
     """
     facts = DatasetFacts.read(root)
     if not facts.bomb:

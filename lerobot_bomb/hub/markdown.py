@@ -22,14 +22,14 @@ def command(name: str, *flags: str) -> str:
 
 
 def fenced(text: str, language: str = "") -> str:
-    """Return a block of code that nothing in the text can end."""
+    """Return a block of code, with a fence longer than any run of backticks in it."""
     fence = "`" * max(3, _longest_run(text) + 1)
     shown = "\n".join(map(printable, text.split("\n")))
     return f"{fence}{language}\n{shown}\n{fence}"
 
 
 def code(text: str) -> str:
-    """Return inline code, also for a table, that nothing in the text can end."""
+    """Return inline code, also for a table, with more backticks than any run of them in it."""
     ticks = "`" * (_longest_run(text) + 1)
     pad = " " * ("`" in text)
     return f"{ticks}{pad}{printable(text).replace('|', chr(92) + '|')}{pad}{ticks}"

@@ -216,5 +216,5 @@ def _tell_wrong_quantiles(meta: "LeRobotDatasetMetadata", modes: Collection[Norm
 
 
 def _next(policy: Any) -> Any:
-    """Return LeRobot's class, which a type checker cannot see here, untyped."""
+    """Return `super()` untyped, because a type checker does not see LeRobot's class here."""
     return policy

@@ -47,10 +47,10 @@ class Order:
 
 
 def orders_of(instruction: str) -> list[Order]:
-    """Return the orders of an instruction, in its order.
+    """Return the orders of an instruction, one after the other.
 
     Raises:
-        ValueError: it has another form than LIBERO's.
+        ValueError: the instruction has another form than LIBERO's.
     """
     orders: list[Order] = []
     for part in NEXT_ORDER.split(instruction):

@@ -60,7 +60,7 @@ class PlacesVlaConfig(PointingVlaConfig):
         """Fill in the dataset's places unless the checkpoint has some, and return them.
 
         Raises:
-            ValueError: there is neither, or the dataset cannot be trained on.
+            ValueError: neither has places, or the dataset cannot be trained on.
         """
         if meta is not None:
             self.require_labels(meta)

@@ -291,7 +291,7 @@ class VlaPolicy(ChunkPolicy):
     def select_action(self, batch: dict[str, Tensor], **options: Any) -> Tensor:
         """Return the next normalised action, (B, D); ``options`` as `_predict` takes them.
 
-        With a temporal ensemble every call predicts; otherwise, those that find the queue of actions empty.
+        With a temporal ensemble every call predicts; otherwise only a call that finds the queue empty.
 
         Raises:
             ValueError: the batch has another size than the one before, and `reset` was not called in between.
@@ -333,7 +333,7 @@ class RelativeVlaPolicy(VlaPolicy):
 
     @classmethod
     def from_pretrained(cls, *args: Any, **kwargs: Any) -> Self:
-        """Load as `VlaPolicy` does; relative actions fit the new data."""
+        """Load as `VlaPolicy` does, and fit relative actions to new data."""
         try:
             return super().from_pretrained(*args, **kwargs)
         except ValueError as error:

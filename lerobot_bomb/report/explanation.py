@@ -64,7 +64,7 @@ def _not_asked(moment: ExplainedMoment) -> list[str]:
 
 
 def moment_sections(moment: ExplainedMoment) -> list[Section]:
-    """Write one moment: maps of patches, effects of objects and words, what is restored where."""
+    """Write the section of one moment: maps of patches, effects of objects and words, what is restored."""
     explanation = moment.explanation
     note = (
         f"By how much the score of the clean answer drops; it is {explanation.clean_score:.4g} "

@@ -227,7 +227,7 @@ class EpisodeResult(Record):
 
     @classmethod
     def describe_tasks(cls, records: Sequence[Self]) -> str:
-        """Describe 'tasks 0, 12', or target and colour, each fixed or drawn."""
+        """Describe the tasks: 'tasks 0, 12', or target and colour, each fixed or drawn."""
         first = records[0]
         if first.task_ids is not None:
             return f"tasks {describe_numbers(first.task_ids)}"
@@ -254,7 +254,7 @@ class EpisodeResult(Record):
 
     @classmethod
     def describe_change(cls, pairs: Sequence[tuple[Self, Self]]) -> str:
-        """Describe 'placement error +1.2 mm [+0.3, +2.0] where both put the stone down (40 pairs)'."""
+        """Return 'placement error +1.2 mm [+0.3, +2.0] where both put the stone down (40 pairs)'."""
         both = [pair for pair in pairs if all(each.failure in PUT_DOWN for each in pair)]
         if not both or any(each.target is None for pair in both for each in pair):
             return ""

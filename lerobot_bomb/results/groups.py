@@ -198,7 +198,7 @@ def policy_name(record: Record) -> str:
 
 
 def _group_name(record: Record) -> str:
-    """Return 'act outputs/act, place'."""
+    """Return policy and suite: 'act outputs/act, place'."""
     suite = getattr(record.spec, "suite", None)
     return policy_name(record) + (f", {suite}" if suite else "")
 

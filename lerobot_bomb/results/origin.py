@@ -68,7 +68,7 @@ class PolicyIdentity:
     interventions: tuple[str, ...] = ()  # names of the preprocessor's steps that change the input on purpose
 
     def describe(self) -> str:
-        """Describe 'act', or 'act outputs/act (weights 0123456789ab, settings 0123456789ab)'."""
+        """Describe the policy: 'act', or 'act outputs/act (weights 0123456789ab, settings 0123456789ab)'."""
         revision = f"@{self.revision}" if self.revision else ""
         sums = {"weights": self.weights_sha256, "settings": self.settings_sha256}
         notes = [f"{name} {sha256[:SHOWN_DIGITS]}" for name, sha256 in sums.items() if sha256]

@@ -135,7 +135,7 @@ class Record(ABC):
         """Raise a ValueError that names fields of this environment which contradict each other."""
 
     def refuse_if(self, is_impossible: bool, first: str, *others: str) -> None:
-        """Raise a ValueError that shows fields that are possible each, but not together."""
+        """Raise a ValueError that shows fields that are possible alone, but not together."""
         if is_impossible:
             values = {name: json.dumps(attrgetter(name)(self)) for name in (first, *others)}
             shown = [f"{name}={value[:SHOWN_CHARACTERS]}" for name, value in values.items()]

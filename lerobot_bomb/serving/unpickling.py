@@ -41,7 +41,7 @@ def loads(data: bytes | None) -> Any:
     """Read a RemotePolicyConfig or a TimedObservation.
 
     Raises:
-        pickle.UnpicklingError: the data is something else, or the client sent no end.
+        pickle.UnpicklingError: the data is something else, or the client did not finish it.
     """
     if data is None:
         raise pickle.UnpicklingError("the client ended its message before its end")

@@ -137,7 +137,7 @@ class Workers:
         """Start missing workers, and kill those whose job takes too long.
 
         Raises:
-            RuntimeError: they end before they run, or refuse to; the message says why.
+            RuntimeError: workers end before they run a job, or refuse to; the message says why.
         """
         self._num_idle_ends = 0 if has_progressed else self._num_idle_ends
         for number, worker in enumerate(self._workers):
@@ -192,7 +192,7 @@ def run_part(store: Store, part: str, num_workers: int, timeout_s: int | None = 
     """Run a part of the jobs: start workers, and restart those that ended.
 
     Raises:
-        RuntimeError: they end before they run, or refuse to; the message says why.
+        RuntimeError: workers end before they run a job, or refuse to; the message says why.
     """
     jobs = store.manifest.part(part)
     num_workers = min(num_workers, len(jobs))

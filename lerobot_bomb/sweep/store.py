@@ -84,7 +84,7 @@ class Store:
         return self.folder / JOBS / f"{job.key}.{ending}"
 
     def is_finished(self, job: Job) -> bool:
-        """Return True if the file of its records is there and whole; a crash can cut it off."""
+        """Return True if the job's file of records is there and whole; a crash can cut it off."""
         path = self.file(job, "jsonl")
         try:
             state = path.stat()

@@ -106,7 +106,7 @@ def write_episodes(runs: Mapping[str, ViewedRun], name: str, rrd: Path, mp4: Pat
 
 
 def paths_of(output: Path | None, folder: Path, name: str) -> list[Path]:
-    """Return both files of a user's `output`: its path without .rrd and .mp4, or a folder; None: `folder`."""
+    """Return the .rrd and .mp4 of a user's `output`, a path or an existing folder; None: in `folder`."""
     stem = output or folder / name
     if stem.is_dir():
         stem = stem / name

@@ -89,8 +89,9 @@ def observed_intrinsics(
 def lattice_points(depth_BHW: Tensor, K_B33: Tensor, size: int) -> Tensor:
     """Depth and K of the same images -> (B, R, R, 3) metres at the centres of R = ``size`` cells a side.
 
-    NaN where depth is missing. Each point takes the depth of the pixel that it lies in. The original
-    pools, which blends near and far at edges: that puts 7 % of BOMB's points more than 10 mm off, this 0.6 %.
+    NaN where depth is missing. Each point takes the depth of the pixel that it lies in. The original pools
+    depth, which blends near and far at edges: that puts 7 % of BOMB's points more than 10 mm off, this way
+    0.6 %.
     """
     height, width = depth_BHW.shape[-2:]
     rows, columns = (_nearest_pixels(side, size, depth_BHW.device) for side in (height, width))

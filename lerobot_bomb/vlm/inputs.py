@@ -14,7 +14,7 @@ TEXT_COLUMNS = 16
 
 
 def read_tensor(batch: dict[str, Tensor], key: str, policy_type: str, device: torch.device) -> Tensor:
-    """Return a batch's value; raise if it is absent, on another device or, on the CPU, not in range.
+    """Return a batch's value; raise if absent, on another device or, on the CPU, not finite or in range.
 
     On CUDA the host would have to wait for the last check; `TaskStep` makes it before.
     """

@@ -63,7 +63,7 @@ def resize_intrinsics(K_B33: Tensor, old_size: tuple[int, int], new_size: tuple[
 def back_project(depth_BRR: Tensor, K_B33: Tensor) -> Tensor:
     """(B, R, R) metres along the optical axis -> (B, R, R, 3) metres, x right, y down, z forward.
 
-    Points of the scene at the centres of the pixels. Without a matrix product, which autocast would round.
+    These are the scene's points at the pixels' centres. No matrix product, which autocast would round.
     """
     centers_R = torch.arange(depth_BRR.shape[-1], device=depth_BRR.device) + 0.5
     focal_B2, principal_B2 = K_B33[:, [0, 1], [0, 1]], K_B33[:, :2, 2]

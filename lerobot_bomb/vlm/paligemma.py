@@ -35,7 +35,7 @@ class PaliGemmaPrompt:
 
     @classmethod
     def from_tokenizer(cls, tokenizer: Tokenizer, vlm_model_name: str) -> "PaliGemmaPrompt":
-        """Look everything up.
+        """Look up all tokens.
 
         Raises:
             ValueError: a digit, the space or a special token is not exactly one token.

@@ -133,7 +133,7 @@ class PromptTokens:
         system_prompt: str | None = None,
         chat: ChatFormat = SMOLVLM_CHAT,
     ) -> "PromptTokens":
-        """Look everything up.
+        """Look up all tokens.
 
         Raises:
             ValueError: a digit, the space or a special token is not exactly one token of its own, or not

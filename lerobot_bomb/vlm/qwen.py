@@ -50,7 +50,7 @@ class QwenPrompt:
 
     @classmethod
     def from_tokenizer(cls, tokenizer: Tokenizer, vlm_model_name: str) -> "QwenPrompt":
-        """Look everything up.
+        """Look up all tokens.
 
         Raises:
             ValueError: a special token is not exactly one token.

@@ -110,7 +110,7 @@ def _check_rows(values: Mapping[str, Tensor], num_tasks: int) -> None:
 class TaskTokenizerStep(TaskStep):
     """``task`` (B texts) -> ``observation.language.tokens`` (B, L) and their attention mask (B, L) bool.
 
-    ``template`` is what is written, with ``{}`` for the task. The tokenizer is the step's state, so a
+    ``template`` is the text to write, with ``{}`` for the task. The tokenizer is the step's state, so a
     checkpoint carries it whole. Rows are padded at the end. A dataset has few tasks, so their ids are kept:
     the tokenizer does not run again.
     """

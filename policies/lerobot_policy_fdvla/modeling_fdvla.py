@@ -342,7 +342,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     # Model
 
     def _heads(self, context: Context, attended_BK: Tensor | None = None) -> Heads:
-        """Return noisy actions and times -> velocity and noise (B, K, D); None for a missing head.
+        """Return the function: noisy actions and times -> velocity and noise (B, K, D), None for no head.
 
         ``B`` may be a multiple of the number of observations; draws of one are consecutive. A call is one
         pass over the segment. Its shapes are static, and nothing in it waits for the device.

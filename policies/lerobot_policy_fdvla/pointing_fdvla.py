@@ -137,7 +137,7 @@ def make_pointer(
     """Make the pointer; None without `pointing`. Its places are a checkpoint's or else the dataset's.
 
     Raises:
-        ValueError: there is neither.
+        ValueError: neither has places.
     """
     if not config.pointing:
         return None

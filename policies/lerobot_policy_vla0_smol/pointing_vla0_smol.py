@@ -57,7 +57,7 @@ class TextPointer(DataUnits):
 
     @staticmethod
     def loss_mask(labels: MetricLabels) -> Tensor:
-        """Return (B, J) bool, without other places, which no observation tells."""
+        """Return (B, J) bool; other places are left out, because no observation tells them."""
         loss_mask_BJ = (~labels.is_other[:, None]).repeat(1, NUM_NUMBERS)
         loss_mask_BJ[:, STONE_NUMBERS] = True
         return loss_mask_BJ
