@@ -1,11 +1,11 @@
-"""Writing an answer: ours against transformers' `generate` with xgrammar's logits processor.
+"""Speed of decoding an answer: ours against transformers' `generate` with xgrammar's logits processor.
 
     python benchmarks/decode_speed.py --policy.path=CHECKPOINT \
         --dataset.repo_id=USER/pusht --dataset.root=pusht --json decode_speed.json
 
 Both have the same weights, read the same prompt embeddings and must write the same numbers. The prompts are
-what a trained nano `vla0_smol` meets on frames of held-out episodes. Reading the prompt (prefill) is reported
-apart; bars are on the rest (decode).
+those of a trained nano `vla0_smol` on frames of held-out episodes. Reading the prompt (prefill) is reported
+separately; the bars are on the decoding that follows.
 """
 
 import logging
@@ -31,7 +31,7 @@ BATCH_SIZES = 1, 16
 
 
 def main() -> None:
-    """Time answers, print the tables; exit code 1 where a bar is missed."""
+    """Time answers and print the tables; exit with code 1 if a bar is missed."""
     parser = make_parser(__doc__)
     add_episode_arguments(parser, "vla0_smol")
     parser.add_argument("--repeats", type=positive, default=20, help="answers of each (default: 20)")
@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def time_answers(episodes: Episodes, batch_size: int, repeats: int) -> Rows:
-    """The whole chunk by the peer and by us, without and with drafts; then only what is executed."""
+    """Time the whole chunk by the peer and by us, without and with drafts, then only the executed part."""
     works = episodes.works(batch_size, repeats)
     whole = [replace(work, stop_after=work.grammar.num_numbers) for work in works]
     undrafted = [replace(work, guess=KnownSymbols(work.grammar)) for work in whole]

@@ -1,11 +1,11 @@
-"""Writing an answer on a GPU: ours against transformers' `generate` with xgrammar's logits processor.
+"""Speed of decoding on a GPU: ours against transformers' `generate` with xgrammar's logits processor.
 
     python benchmarks/decode_speed_cuda.py --json decode_speed_cuda.json
 
-A model of SmolVLM2-500M's shape with random weights and random prompts: nothing it writes can be guessed. In
-bfloat16 the peer's weights are bfloat16 and ours are float32, cast once an answer; in float32 both must write
-the same numbers. Reading the prompt (prefill) is reported apart; bars are on the rest (decode). Then a policy
-of this shape, from images to actions.
+The model has SmolVLM2-500M's shape, random weights and random prompts, so nothing it writes can be guessed.
+In bfloat16 the peer's weights are bfloat16 and ours are float32, cast once per answer; in float32 both must
+write the same numbers. Reading the prompt (prefill) is reported separately; the bars are on the decoding. A
+policy of this shape is then timed from images to actions.
 """
 
 import copy
@@ -73,7 +73,7 @@ VISION_500M = {
 
 
 def main() -> None:
-    """Time both, print the tables; exit code 1 where a bar is missed."""
+    """Time decoding and a policy, print the tables; exit with code 1 if a bar is missed."""
     parser = make_parser(__doc__)
     parser.add_argument("--repeats", type=positive, default=10, help="answers of each (default: 10)")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="default: all")
@@ -107,7 +107,7 @@ def time_decoding_all(repeats: int, bars: dict[str, bool]) -> dict[str, Any]:
 
 
 def config_500m() -> dict[str, Any]:
-    """Config of a SmolVLM of this shape with our symbols' tokens."""
+    """Return the config of a SmolVLM of the 500M shape, with our symbols' tokens."""
     config = nano_config(load_tokenizer(NANO))
     config["text_config"] |= TEXT_500M
     return config | {"scale_factor": 4, "vision_config": VISION_500M}
@@ -156,7 +156,7 @@ def time_decoding(
 
 
 class Ours:
-    """The whole answer, and its first pass, which reads the prompt."""
+    """Writes an answer; times the whole, and the first pass, which reads the prompt."""
 
     def __init__(self, writer: NumberWriter, symbol_ids: Tensor, dtype: torch.dtype):
         self._writer, self._symbol_ids, self._dtype = writer, symbol_ids, dtype
@@ -193,7 +193,7 @@ def ends_of_passes() -> Iterator[list[torch.cuda.Event]]:
 
 
 def time_policy(repeats: int) -> Rows:
-    """Images, instruction and state to a chunk of actions, without what LeRobot does around it."""
+    """Time a policy from images, instruction and state to a chunk of actions, without the processors."""
     figures = {}
     for compiled in (False, True):
         policy = make_policy(compiled)
@@ -214,7 +214,7 @@ def time_policy(repeats: int) -> Rows:
 
 
 def make_policy(compiled: bool) -> Vla0SmolPolicy:
-    """Make a policy of this shape, with random weights."""
+    """Make a policy of the 500M shape, with random weights."""
     config = Vla0SmolConfig(
         vlm_config=config_500m(),
         prompt_tokens=PromptTokens.from_tokenizer(load_tokenizer(NANO), NANO).to_dict(),

@@ -1,13 +1,13 @@
-"""Choosing a chunk's cells: `spatialvla_grid` against transformers' `generate`.
+"""Speed of choosing a chunk's cells: `spatialvla_grid` against transformers' `generate`.
 
     python benchmarks/decode_speed_grid.py --policy.path=CHECKPOINT --dataset.repo_id=USER/pusht \
         --dataset.root=pusht --json decode_speed_grid.json
 
-The peer is the stock PaliGemma of the same weights whose words end with the cells; a logits processor lets
-only the slot's cells through. Both see the same and must choose the same cells: a trained nano policy, frames
-of held-out episodes; one of random weights, random images and instructions, where a draft has little to use.
-Seeing and reading the prompt (prefill) is reported apart; bars are on the rest (decode). Of the peer's
-prefill, cutting the images and putting the prompt together is left out.
+The peer is the stock PaliGemma with the same weights. The cells are its last words, and a logits processor
+lets only those of the slot through. Both see the same inputs and must choose the same cells: a trained nano
+policy sees frames of held-out episodes; one with random weights sees random images and instructions, where a
+draft has little to use. Reading images and prompt (prefill) is reported separately; the bars are on the
+decoding. The peer's prefill excludes cropping the images and building the prompt.
 """
 
 import copy
@@ -48,7 +48,7 @@ IMAGE_SIZE = 128
 
 
 def main() -> None:
-    """Time both, print the tables; exit code 1 where a bar is missed."""
+    """Time the policy and the peer, print the tables; exit with code 1 if a bar is missed."""
     parser = make_parser(__doc__)
     add_episode_arguments(parser, "spatialvla_grid")
     parser.add_argument("--repeats", type=positive, default=20, help="answers of each (default: 20)")
@@ -78,7 +78,7 @@ def main() -> None:
 
 
 def make_policy(num_dims: int) -> SpatialvlaGridPolicy:
-    """Nano, random weights, the default groups of so many action dimensions."""
+    """Return a nano policy with random weights and the default groups of this many action dimensions."""
     torch.manual_seed(0)
     config = SpatialvlaGridConfig(
         vlm_model_name="nano",
@@ -103,12 +103,12 @@ def time_decoding(
 
 
 def num_slots(policy: SpatialvlaGridPolicy) -> int:
-    """Cells of a chunk."""
+    """Return the number of cells in a chunk."""
     return policy.config.chunk_size * len(policy.grids.groups)
 
 
 def choose(policy: SpatialvlaGridPolicy, draft: str, batch: dict[str, Any]) -> Timed:
-    """The policy's own way."""
+    """Choose and time a chunk's cells with the policy's own decoder."""
     policy._decoder.drafted = draft != "none"
     started = time.perf_counter()
     with _moments_of_passes() as moments_s:
@@ -132,7 +132,7 @@ def _moments_of_passes() -> Iterator[list[float]]:
 
 
 class StockGenerate:
-    """Greedy search by transformers' own model, masks and cache; the last words are the cells."""
+    """Greedy search by transformers' own model, masks and cache; its last words are the cells."""
 
     def __init__(self, policy: SpatialvlaGridPolicy):
         self._policy = policy
@@ -150,7 +150,7 @@ class StockGenerate:
         self._vlm.config.text_config.vocab_size = self._vlm.model.vocab_size = len(words.weight)
 
     def inputs(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """The policy's prompt, padded on the left, and images, as the stock model reads them."""
+        """Return the policy's prompt, padded on the left, and its images, as the stock model reads them."""
         policy, prompt = self._policy, self._policy.prompt(batch)
         ids, written = torch.zeros_like(prompt.ids), torch.zeros_like(prompt.ids)
         for row, kept in enumerate(prompt.mask):
@@ -165,7 +165,7 @@ class StockGenerate:
         }
 
     def __call__(self, inputs: dict[str, Tensor]) -> Timed:
-        """The cells of a chunk; a pass ends with its logits."""
+        """Choose and time the cells of a chunk; a pass ends with its logits."""
         slots = _Slots(self._policy, self._first_cell)
         started = time.perf_counter()
         tokens = self._vlm.generate(
@@ -178,7 +178,7 @@ class StockGenerate:
 
 
 class _Slots(LogitsProcessor):
-    """Lets only the slot's cells through; knows when each pass was done."""
+    """Lets only the slot's cells through; records when each pass ended."""
 
     def __init__(self, policy: SpatialvlaGridPolicy, first_cell: int):
         self.moments_s: list[float] = []

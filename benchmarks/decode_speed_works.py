@@ -31,7 +31,7 @@ from lerobot_bomb.vlm.backbone import Backbone
 
 @dataclass(frozen=True)
 class Timed:
-    """One answer of each row."""
+    """Answers of a batch, one per row, and how long they took."""
 
     numbers: Tensor  # (B, N)
     prefill_s: float
@@ -42,7 +42,7 @@ class Timed:
 def compare(
     runs: dict[str, tuple[Callable[[Any], Timed], Sequence[Any]]], *, must_agree: bool = True
 ) -> Rows:
-    """Time every way on every work, in turn, writing the same if they must. Gains are over the first."""
+    """Time each way on each request, in turn, and compare the numbers. Gains are over the first way."""
     timed: dict[str, list[Timed]] = {name: [] for name in runs}
     for run, works in runs.values():
         run(works[0])
@@ -72,7 +72,7 @@ def compare(
 
 @dataclass(frozen=True)
 class DecodeRequest:
-    """A batch of prompts, and what is to be written after each."""
+    """Batch of prompts, and the numbers to be written after each."""
 
     backbone: Backbone
     prompt: Prompt
@@ -91,7 +91,7 @@ def add_episode_arguments(parser: argparse.ArgumentParser, policy_type: str) -> 
 
 
 class Episodes:
-    """A trained policy with other flags, and the frames that it meets."""
+    """Loads a trained policy with given flags, and the frames that it meets."""
 
     def __init__(self, args: argparse.Namespace):
         self._path, self._first = args.policy_path, args.episode
@@ -109,7 +109,7 @@ class Episodes:
         return works
 
     def batches(self, batch_size: int, num_predictions: int, **options: Any) -> tuple[Any, list[Any]]:
-        """The policy with such flags, and what it sees: one row an episode, every `n_action_steps`."""
+        """Return the policy with these options, and its inputs: a row per episode, every `n_action_steps`."""
         policy, preprocessor = self._load(**options)
         frames = [
             [self._frame(row, prediction * policy.config.n_action_steps) for row in range(batch_size)]
@@ -150,7 +150,7 @@ def _captured(works: list[DecodeRequest]) -> Iterator[None]:
 
 
 class Timer(Continuation):
-    """Knows when the prompt had been read."""
+    """Continuation that records when the prompt has been read."""
 
     prompt_read_s = 0.0
 
@@ -164,7 +164,7 @@ class Timer(Continuation):
 
 
 def ours(work: DecodeRequest) -> Timed:
-    """The decoder; the first pass reads the prompt."""
+    """Time our decoder, whose first pass reads the prompt."""
     started = time.perf_counter()
     max_symbols = work.grammar.max_symbols(work.stop_after)
     model = Timer(continue_prompt(work.backbone, work.prompt, work.symbol_ids, max_symbols))
@@ -180,12 +180,12 @@ def ours(work: DecodeRequest) -> Timed:
 
 
 def peer(work: DecodeRequest) -> Timed:
-    """The public way."""
+    """Time the public way."""
     return XgrammarGenerate(work.backbone, work.symbol_ids, work.grammar).timed(work.prompt)
 
 
 class XgrammarGenerate:
-    """Greedy search after given prompt embeddings; the language is ours, told to xgrammar."""
+    """Greedy search after given prompt embeddings, with our grammar translated for xgrammar."""
 
     def __init__(self, backbone: Backbone, symbol_ids: Tensor, grammar: NumberGrammar):
         self._backbone, self._symbol_ids, self._grammar = backbone, symbol_ids, grammar
@@ -204,7 +204,7 @@ class XgrammarGenerate:
     def __call__(
         self, embeds_BLH: Tensor, mask_BL: Tensor, max_symbols: int | None = None
     ) -> tuple[Tensor, int]:
-        """(B, N) numbers and the passes they took."""
+        """Return the (B, N) numbers and how many passes they took."""
         embeds_BLH, mask_BL = _padded_left(embeds_BLH, mask_BL)
         model: Any = self._backbone.vlm
         ids_BA = model.generate(
@@ -220,7 +220,7 @@ class XgrammarGenerate:
         return read_answer(symbols_BA, self._grammar.num_numbers), symbols_BA.shape[1]
 
     def timed(self, prompt: Prompt) -> Timed:
-        """The whole answer, and one symbol: what it takes to read the prompt."""
+        """Time the whole answer, and one symbol, which is the time to read the prompt."""
         self(prompt.embeds, prompt.mask, max_symbols=1)
         _, prefill_s = wait_and_time(lambda: self(prompt.embeds, prompt.mask, max_symbols=1))
         (numbers, num_passes), whole_s = wait_and_time(lambda: self(prompt.embeds, prompt.mask))
@@ -228,7 +228,7 @@ class XgrammarGenerate:
 
 
 def read_answer(symbol_BA: Tensor, num_numbers: int) -> Tensor:
-    """(B, num_numbers) the first numbers that rows of symbols spell, the first symbol being a space."""
+    """Return the first numbers (B, num_numbers) that rows of symbols spell after their leading space."""
     is_digit_BA = symbol_BA < SPACE
     column_A = torch.arange(symbol_BA.shape[1], device=symbol_BA.device)
     end_BA = torch.where(is_digit_BA, len(column_A), column_A).flip(1).cummin(dim=1).values.flip(1)

@@ -1,12 +1,12 @@
-"""A query of `fdvla`: the prompt read once, against reading it anew in every sampling step.
+"""Speed of a query of `fdvla`: the prompt read once, against reading it anew in every sampling step.
 
     OMP_NUM_THREADS=1 python benchmarks/fdvla_speed.py --json fdvla_speed.json
     python benchmarks/fdvla_speed.py --device=cuda --json fdvla_speed_cuda.json
 
-All are the same policy with the same weights, see the same random images and start from the same noise;
-their actions must agree. Weights are random: nano, and the shape of Qwen2.5-0.5B with a vision model of 3
-layers. The bar is over reading the whole prompt, images included, in every step; where only the language
-model reads it anew stands beside. On CUDA a query's sampling steps are one CUDA graph; a row is without it.
+All ways use the same policy and weights, see the same random images and start from the same noise, so their
+actions must agree. The models have random weights: nano, and the shape of Qwen2.5-0.5B with a vision model of
+3 layers. The bar compares with reading the whole prompt, images included, in every step; a second row sees
+the images once. On CUDA a query's sampling steps are one CUDA graph; one row runs without it.
 """
 
 import logging
@@ -55,7 +55,7 @@ TEXT_05B = {
 
 
 def main() -> None:
-    """Time both, print the tables; exit code 1 where a bar is missed."""
+    """Time all ways and print the tables; exit with code 1 if a bar is missed."""
     parser = make_parser(__doc__)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--repeats", type=positive, default=10, help="queries of each (default: 10)")
@@ -91,7 +91,7 @@ def main() -> None:
 
 
 def make_policy(model: str, device: str, dtype: str) -> FdvlaPolicy:
-    """Random weights, the default chunk, steps and sampler."""
+    """Return a policy with random weights and the default chunk, steps and sampler."""
     torch.manual_seed(0)
     tokenizer = load_tokenizer(NANO)
     vlm_config = nano_qwen_config(tokenizer)
@@ -110,7 +110,7 @@ def make_policy(model: str, device: str, dtype: str) -> FdvlaPolicy:
 
 
 def time_queries(policy: FdvlaPolicy, batches: list[dict[str, Any]]) -> Rows:
-    """Time every way on every batch, in turn; the others must give the first one's actions."""
+    """Time every way on every batch, in turn; all must give the same actions."""
     ways: dict[str, Callable[[dict[str, Any]], Tensor]] = {
         EVERY_STEP: partial(read_in_every_step, policy, sees_once=False),
         "the same, images seen once": partial(read_in_every_step, policy, sees_once=True),
@@ -144,7 +144,7 @@ def time_queries(policy: FdvlaPolicy, batches: list[dict[str, Any]]) -> Rows:
 
 
 def read_in_every_step(policy: FdvlaPolicy, batch: dict[str, Any], *, sees_once: bool) -> Tensor:
-    """The language model reads the prompt anew in every step; the vision model, too, unless it sees once."""
+    """Sample a chunk, reading the prompt anew in every step; the images too, unless `sees_once`."""
     embed = policy.embed
     with policy.autocast(), torch.no_grad():
         if sees_once:
@@ -160,7 +160,7 @@ def read_in_every_step(policy: FdvlaPolicy, batch: dict[str, Any], *, sees_once:
 
 
 def uncaptured(policy: FdvlaPolicy, batch: dict[str, Any]) -> Tensor:
-    """The policy's own way, kernel by kernel."""
+    """Sample a chunk the policy's own way, but without a CUDA graph."""
 
     def sample(_: object, *tensors: Tensor) -> tuple[Tensor, ...]:
         return policy._sample(*tensors)

@@ -1,4 +1,4 @@
-"""Do the heads of ``fdvla`` learn a distribution with two modes, and which of them a word means?
+"""Do the heads of ``fdvla`` learn a distribution with two modes, and which mode a word means?
 
 Points of the plane stand for actions: "left" and "right" name a mode, "any" means both. Heads, DualMod,
 segment, loss and samplers are the policy's. One transformer layer takes the place of the vision-language
@@ -104,7 +104,7 @@ class Toy(nn.Module):
 
 
 def main() -> None:
-    """Train the variants, print what they make of each word."""
+    """Train the variants and print how well each samples every word; exit with code 1 if a bar is missed."""
     parser = make_parser(__doc__)
     parser.add_argument("--steps", type=positive, default=1000, help="of training, each variant")
     parser.add_argument("--samples", type=positive, default=1000, help="of each word")
@@ -138,7 +138,7 @@ def main() -> None:
 
 
 def train(variant: Variant, num_steps: int, seed: int) -> Toy:
-    """A toy that has learned all words."""
+    """Train a toy on all words."""
     torch.manual_seed(seed)
     toy, generator = Toy(variant), torch.Generator().manual_seed(seed)
     optimizer = torch.optim.AdamW(toy.parameters(), LEARNING_RATE)
@@ -160,7 +160,7 @@ def train(variant: Variant, num_steps: int, seed: int) -> Toy:
 
 
 def draw_points(words_B: Tensor, generator: torch.Generator) -> Tensor:
-    """(B, 1, 2) data that the words mean."""
+    """Draw data (B, 1, 2) from the modes that the words mean."""
     shares_BM = torch.tensor([*WORDS.values()])[words_B]
     modes_B = shares_BM.multinomial(1, generator=generator)[:, 0]
     return (MODES_MD[modes_B] + STD * torch.randn(len(words_B), 2, generator=generator))[:, None]
@@ -168,7 +168,7 @@ def draw_points(words_B: Tensor, generator: torch.Generator) -> Tensor:
 
 @torch.no_grad()
 def draw_samples(toy: Toy, sampler: str, num_samples: int, seed: int) -> dict[str, Tensor]:
-    """(N, 2) of each word, all from the same noise."""
+    """Return {word: (N, 2) samples}, all from the same noise."""
     noise_NKD = torch.randn(num_samples, 1, 2, generator=torch.Generator().manual_seed(seed))
     heads = {word: partial(toy, torch.full((num_samples,), i)) for i, word in enumerate(WORDS)}
     return {
@@ -178,7 +178,7 @@ def draw_samples(toy: Toy, sampler: str, num_samples: int, seed: int) -> dict[st
 
 
 def measure(variant: str, word: str, meant: tuple[float, float], points_ND: Tensor) -> Row:
-    """Samples (N, 2) against the data's modes, and whether they meet the bars."""
+    """Compare samples (N, 2) with the data's modes, and with the bars."""
     near_MN = near_modes(points_ND, MODES_MD, NEAR)
     shares = near_MN.float().mean(dim=1).tolist()
     meant_modes = [m for m, share in enumerate(meant) if share]

@@ -23,7 +23,7 @@ Clouds = dict[str, Tensor]  # word -> (N, 2)
 
 
 def plot(text: str) -> Path:
-    """A file that a plot can be written to."""
+    """Parse the path of a plot that can be written."""
     path = writable(text)
     if path.suffix.lower() not in SUFFIXES:
         raise argparse.ArgumentTypeError(f"{text!r} must end in {' or '.join(SUFFIXES)}")
@@ -36,7 +36,7 @@ def near_modes(points_N2: Tensor, modes_M2: Tensor, radius: float) -> Tensor:
 
 
 def draw_plot(path: Path, columns: dict[str, Clouds], modes_M2: Tensor, radius: float) -> None:
-    """Write a plot: rings with ``radius`` around the modes, and what share of the points each holds.
+    """Write a plot: rings of ``radius`` around the modes, and the share of the points in each.
 
     Columns have the same words; the first is the data.
     """
@@ -52,7 +52,7 @@ def draw_plot(path: Path, columns: dict[str, Clouds], modes_M2: Tensor, radius: 
 
 
 def _tile(points_N2: Tensor, modes_M2: Tensor, radius: float, rgb: tuple[int, int, int]) -> np.ndarray:
-    """(TILE_SIZE, TILE_SIZE, 3) uint8."""
+    """Draw a tile, (TILE_SIZE, TILE_SIZE, 3) uint8."""
     large = Image.new("RGB", (SCALE * TILE_SIZE, SCALE * TILE_SIZE), TILE_PAPER)
     pen = ImageDraw.Draw(large)
     for place in _places(points_N2, SCALE):

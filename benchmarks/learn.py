@@ -1,17 +1,17 @@
-"""Do policies that start from nothing learn to place stones that they have never seen, on one CPU core?
+"""Do policies learn from random weights, on one CPU core, to place stones on boards they have not seen?
 
 A policy is trained by the stock `lerobot-train` on demonstrations of the scripted expert, and its checkpoints
-are evaluated by the stock `lerobot-eval` on seeds that it has not seen; the last one twice more: with black
-images, and given the instruction of another episode. The policy is a small probe made for this task
-(lerobot_policy_keypoint_probe/: can it be learnt at all?), or by configs/TASK_TYPE.yaml one of ours, or
+are evaluated by the stock `lerobot-eval` on unseen seeds. The last one is evaluated twice more: with black
+images, and with the instruction of another episode. The policy is a small probe made for this task
+(lerobot_policy_keypoint_probe/: can it be learnt at all?), one of ours by configs/TASK_TYPE.yaml, or
 LeRobot's `act` or `diffusion` (pip install 'lerobot[diffusion]') with about as many CPU minutes.
 
     OMP_NUM_THREADS=1 python benchmarks/learn.py one_target --policy.type=vla0_smol --output_dir learn
 
 What is finished stays in the output folder and is not done again: the dataset, the training, each evaluation.
 A training that was killed starts anew. Flags --policy.NAME=VALUE go to `lerobot-train`; `robust` trains on
-from --policy.path=CHECKPOINT, or else from where its recipe says. Recipes are chosen on other seeds than are
-reported: --first_seed=50000.
+from --policy.path=CHECKPOINT, or else from where its recipe says. Recipes are chosen on other seeds than the
+reported ones: --first_seed=50000.
 """
 
 import argparse
@@ -64,7 +64,7 @@ NO_IMAGES, OTHER_INSTRUCTION = "blank images", "another episode's instruction"
 
 
 def main() -> None:
-    """Record, train, evaluate every checkpoint, print the curve; exit code 1 where the bar is missed."""
+    """Record, train, evaluate every checkpoint, print the curve; exit with code 1 if the bar is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("task", choices=TASKS)
     types = [PROBE, *POLICY_TYPES, *RIVALS]
@@ -95,7 +95,7 @@ def main() -> None:
 
 
 def run_task(args: argparse.Namespace) -> int:
-    """The whole task in args.output_dir; 0 if the bar was reached."""
+    """Run the whole task in args.output_dir; return 0 if the bar was reached."""
     task, folder = TASKS[args.task], args.output_dir
     if args.policy_type not in task.trainings:
         raise RuntimeError(f"{args.task} is for --policy.type={' or '.join(task.trainings)}")
@@ -118,7 +118,7 @@ def run_task(args: argparse.Namespace) -> int:
 
 
 def run_claimed(args: argparse.Namespace, task: Task, run: dict[str, Any]) -> int:
-    """The whole task in its folder, which nothing else writes to; 0 if the bar was reached."""
+    """Run the whole task in its folder, which nothing else writes to; return 0 if the bar was reached."""
     folder, training = args.output_dir, task.trainings[args.policy_type]
     demonstrations = run["demonstrations"]
     record(task, demonstrations, folder / "dataset")
@@ -168,12 +168,12 @@ def run_claimed(args: argparse.Namespace, task: Task, run: dict[str, Any]) -> in
 
 
 def recipe_task(task: str) -> str:
-    """The task that names the recipes' files."""
+    """Return the task whose name the recipes' files carry."""
     return TASKS[task].recipe or task
 
 
 def verdict(last: Point, bar: Bar) -> int:
-    """Say whether the last checkpoint reaches the bar; 0 if it does."""
+    """Print whether the last checkpoint reaches the bar; return 0 if it does."""
     is_reached = last.num_successes >= bar.success * last.num_episodes and last.cpu_minutes <= bar.cpu_minutes
     print(
         f"To be reached: {100 * bar.success:.0f} % within {bar.cpu_minutes:.0f} CPU minutes: "
@@ -195,7 +195,7 @@ def claim(folder: Path, run: dict[str, Any]) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, as do the commands that are run meanwhile, even if this process is killed.
+    """Hold the folder's lock; commands run meanwhile hold it too, even if this process is killed.
 
     Raises:
         RuntimeError: another process holds it.
@@ -213,7 +213,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def record(task: Task, demonstrations: int, dataset: Path) -> None:
-    """Record the expert's episodes, or the parts of a task, which are merged."""
+    """Record the expert's episodes, or record and merge the parts of a task."""
     if dataset.exists():
         return
     if not task.parts:
@@ -242,7 +242,7 @@ def merge(folders: Sequence[Path], dataset: Path) -> None:
 
 
 def task_ids_of(task: Task) -> tuple[int, ...]:
-    """Task ids that the demonstrations are of; () where they are drawn."""
+    """Return the task ids of the demonstrations; () if they are drawn."""
     return tuple(shown_pairs()) if task.is_partial else task.task_ids
 
 
@@ -273,7 +273,7 @@ def run_record(task: Task, folder: Path, part: Part, *flags: str) -> None:
 
 
 def train(folder: Path, run: dict[str, Any]) -> dict[str, float]:
-    """Stock `lerobot-train` of a run; {"minutes", "cpu_minutes"} that it took."""
+    """Train a run by stock `lerobot-train`; return the {"minutes", "cpu_minutes"} that it took."""
     times = folder / "training.json"
     if times.exists():
         return json.loads(times.read_text())
@@ -302,7 +302,7 @@ def train(folder: Path, run: dict[str, Any]) -> dict[str, float]:
 
 
 def probe_recipe() -> list[str]:
-    """Flags of `lerobot-train` with which the probe learns."""
+    """Return the flags of `lerobot-train` for the probe."""
     return [
         f"--policy.discover_packages_path={PLUGIN}",
         f"--policy.type={PROBE}",
@@ -320,7 +320,7 @@ def checkpoints(folder: Path) -> dict[int, Path]:
 def evaluate_checkpoints(
     task: Task, folder: Path, first_seed: int, last: int
 ) -> dict[int, list[EpisodeResult]]:
-    """{training step: results}; all but the last are only the curve."""
+    """Evaluate each checkpoint, {training step: results}; all but the last in fewer episodes."""
     return {
         step: evaluate(
             task,
@@ -336,9 +336,9 @@ def evaluate_checkpoints(
 def evaluate_controls(
     task: Task, folder: Path, first_seed: int, given: dict[str, str]
 ) -> dict[str, list[EpisodeResult]]:
-    """{control: results} of the last checkpoint with black cameras, and given other instructions.
+    """Evaluate the last checkpoint with black images and with other instructions, {control: results}.
 
-    Where all episodes have one target there are none.
+    If all episodes have one target, ``given`` is empty and the second control is left out.
     """
     import lerobot_policy_keypoint_probe  # noqa: F401  its processor step must be known when it is loaded
 
@@ -359,7 +359,7 @@ def evaluate_controls(
 
 
 def evaluate_conditions(task: Task, folder: Path, first_seed: int) -> dict[str, int]:
-    """{condition: successes} of the last checkpoint in CURVE_EPISODES episodes each; prints the table."""
+    """Evaluate the last checkpoint, CURVE_EPISODES each; print a table, return {condition: successes}."""
     if not task.conditions:
         return {}
     checkpoint, output_dir = last_checkpoint(folder / "train"), folder / "eval_conditions"
@@ -379,7 +379,7 @@ def evaluate(
     episodes: int,
     conditions: Sequence[str] = (NONE,),
 ) -> list[EpisodeResult]:
-    """Stock `lerobot-eval` on unseen seeds, so many under each condition; their results."""
+    """Run stock `lerobot-eval` on unseen seeds, so many under each condition; return their results."""
     results = output_dir / "results.jsonl"
     finished = output_dir / "finished"  # an evaluation that was killed leaves results of some episodes
     if not finished.exists():
@@ -408,12 +408,12 @@ def evaluate(
 
 
 def count_named(rows: list[EpisodeResult], given: dict[str, str], targets: dict[str, tuple[int, int]]) -> int:
-    """Stones put down nearest to the intersection that the policy was given."""
+    """Count the stones put down nearest to the intersection in the instruction that the policy was given."""
     return sum(row.nearest_intersection == targets[given[row.instruction]] for row in put_down(rows))
 
 
 def _children_cpu_s() -> float:
-    """CPU seconds, user and system, of all commands that have ended."""
+    """Return the CPU seconds, user and system, of all commands that have ended."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
 

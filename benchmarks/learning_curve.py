@@ -38,7 +38,7 @@ class Point:
 
 
 def count(rows: list[EpisodeResult], step: int, cpu_minutes: float) -> Point:
-    """The episodes of one checkpoint."""
+    """Count the outcomes of one checkpoint's episodes."""
     down = put_down(rows)
     grounded = [row for row in down if is_grounded(row)]
     return Point(
@@ -64,7 +64,7 @@ def print_points(points: dict[str, Point]) -> None:
 
 
 def as_figures(points: dict[str, Point]) -> dict[str, Any]:
-    """The points as JSON."""
+    """Return the points ready for JSON."""
     return {name: asdict(point) for name, point in points.items()}
 
 

@@ -16,7 +16,7 @@ PROBE = "keypoint_probe"
 RIVALS = ("act", "diffusion")  # LeRobot's; they read no instruction
 FIRST_SEED = 200_000  # of the demonstrations; LeRobot evaluates from 1000 on
 SHOWN, SEVERAL = "as in the demonstrations", "several left out"
-# of the targets that the split 'train' has, those that get no stone of a colour: one per row and column
+# targets of the split 'train' that no demonstration gives a stone of the colour: one per row and column
 LEFT_OUT_PAIRS = {
     "black": ((0, 0), (1, 2), (2, 1), (3, 4), (4, 3)),
     "white": ((0, 1), (1, 4), (2, 0), (3, 3), (4, 2)),
@@ -42,7 +42,7 @@ class Training:
 
 @dataclass(frozen=True)
 class Part:
-    """Recording that the dataset of a task is merged from: so many demonstrations, or static scenes."""
+    """One recording of a task's merged dataset: so many demonstrations, or static scenes."""
 
     suite: str
     number: int
@@ -52,7 +52,7 @@ class Part:
 
     @property
     def name(self) -> str:
-        """Name of its folder."""
+        """Name of the recording's folder."""
         tasks = f"_tasks_{'_'.join(map(str, self.task_ids))}" if self.task_ids else ""
         return f"{'scenes' if self.is_static else 'shown'}_{self.suite}{tasks}"
 
@@ -75,7 +75,7 @@ class Task:
     env_flags: tuple[str, ...] = ()  # with which the environment is recorded and run
 
 
-# Places that relations name are read after many boards, those with a name of their own after a few.
+# Places named by a relation take many boards to learn, those with a name of their own only a few.
 ALL_SUITES = (
     Part("spatial", 48_000, is_static=True, task_ids=(0, 1, 2, 3, 4, 11)),
     Part("spatial", 4_000, is_static=True, task_ids=(5, 6, 7, 8, 9, 10)),
@@ -163,14 +163,14 @@ def shown_pairs() -> list[int]:
 
 
 def by_suite(rows: list[EpisodeResult]) -> dict[str, list[EpisodeResult]]:
-    """{suite: its rows} of an evaluation on several; {} on one."""
+    """Return {suite: its records} of an evaluation on several suites; {} on one."""
     suites = sorted({row.spec.suite for row in rows})
     each = {suite: [row for row in rows if row.spec.suite == suite] for suite in suites}
     return each if len(suites) > 1 else {}
 
 
 def by_what_is_left_out(rows: list[EpisodeResult]) -> dict[str, list[EpisodeResult]]:
-    """{what of an episode no demonstration showed: its rows}."""
+    """Group records by what of their episode no demonstration showed."""
     groups: dict[str, list[EpisodeResult]] = {}
     for row in rows:
         target, color = row.target, row.color

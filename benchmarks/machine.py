@@ -27,14 +27,14 @@ def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def positive(text: str) -> int:
-    """A whole number from 1 on."""
+    """Parse a whole number from 1 on."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from 1 on")
     return int(text)
 
 
 def writable(text: str) -> Path:
-    """A file in a folder that exists."""
+    """Parse the path of a file that can be written."""
     path = Path(text)
     if path.is_dir() or not os.access(path.parent, os.W_OK):
         raise argparse.ArgumentTypeError(f"{text!r} cannot be written")
@@ -42,7 +42,7 @@ def writable(text: str) -> Path:
 
 
 def require_idle_machine(force: bool) -> None:
-    """Print the load average; leave with exit code 1 when other work would spoil the figures."""
+    """Print the load average; exit with code 1 if other work would spoil the figures."""
     num_cores = os.cpu_count() or 1
     load = os.getloadavg()[0]
     print(f"{platform.processor() or platform.machine()}, {num_cores} cores, load average {load:.2f}")
@@ -53,7 +53,7 @@ def require_idle_machine(force: bool) -> None:
 
 
 def require_cuda(instead: str) -> None:
-    """Leave with exit code 1, and what to do instead, where no CUDA device is."""
+    """Exit with code 1, saying what to do instead, if there is no CUDA device."""
     import torch
 
     if not torch.cuda.is_available():
@@ -61,7 +61,7 @@ def require_cuda(instead: str) -> None:
 
 
 def milliseconds(call: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
-    """Return how long a call takes."""
+    """Return the milliseconds that a call takes."""
     start = clock()
     call()
     return 1e3 * (clock() - start)
@@ -98,7 +98,7 @@ def write_figures(path: Path | None, figures: dict[str, Any]) -> None:
 
 
 def finish(path: Path | None, figures: dict[str, Any], bars: dict[str, bool]) -> None:
-    """Print which bars hold, write the figures, leave; exit code 1 where a bar is missed."""
+    """Print which bars hold, write the figures and exit, with code 1 if a bar is missed."""
     print("\n".join(f"{'ok' if holds else 'MISSED'}: {bar}" for bar, holds in bars.items()))
     write_figures(path, {**figures, "bars": bars})
     sys.exit(0 if all(bars.values()) else 1)

@@ -43,7 +43,7 @@ SHARE_BEFORE = 0.6  # of the minutes, before a policy's own episodes are relabel
 
 @dataclass(frozen=True)
 class Data:
-    """Recordings that are merged, and the environment's flags with which they are made and run."""
+    """Recordings to merge, and the environment's flags for recording and evaluating."""
 
     parts: tuple[Part, ...] = (*SCENES, *SHOWN)
     env_flags: tuple[str, ...] = ()
@@ -63,7 +63,7 @@ DATA = {
 
 @dataclass(frozen=True)
 class Version:
-    """A way to train a policy type: what its base's flags are changed to, on which data."""
+    """One way to train a policy type: the flags that differ from its base, and the data."""
 
     policy_type: str
     flags: tuple[str, ...] = ()
@@ -147,7 +147,7 @@ class Run:
         self._pace = args.output_dir / f"{name}.pace.json"
 
     def results(self) -> list[EpisodeResult]:
-        """Return the results of all suites, after whatever is missing was done."""
+        """Do whatever is missing, then return the results of all suites."""
         dataset = self._all / self._version.data / "dataset"
         dataset.parent.mkdir(exist_ok=True)
         record(self._data.task(SUITES[0]), 0, dataset)
@@ -190,7 +190,7 @@ class Run:
         return folder
 
     def _trained(self, dataset: Path, folder: Path, steps: int, *flags: str) -> Path:
-        """Return the checkpoint at the end of a training, which goes on if it was killed."""
+        """Train, or resume a training that was killed; return its last checkpoint."""
         finished = folder.with_suffix(".finished")
         if not finished.exists():
             config = last_checkpoint(folder) / "train_config.json"
@@ -203,7 +203,7 @@ class Run:
         return last_checkpoint(folder)
 
     def _num_steps(self, dataset: Path) -> int:
-        """Return how many steps the minutes are enough for, by two short trainings."""
+        """Return how many steps fit into the minutes, by two short trainings."""
         if not self._pace.exists():
             recipe = f"--config_path={recipe_path(RECIPE, self._version.policy_type)}"
             flags = [recipe, *_data_flags(dataset), *self._version.flags]
@@ -228,7 +228,7 @@ def _train_command(dataset: Path, folder: Path, steps: int, seed: int) -> list[s
 
 
 def episode_means(runs: Sequence[Sequence[EpisodeResult]], suite: str) -> dict[int, float]:
-    """{seed of an episode: share of the trainings that solved it}."""
+    """Return {seed of an episode: share of the trainings that solved it}."""
     solved: dict[int, list[bool]] = {}
     for result in (result for run in runs for result in run if result.spec.suite == suite):
         solved.setdefault(result.spec.seed, []).append(result.is_success)
@@ -261,7 +261,7 @@ def _cells(first: list[list[EpisodeResult]], runs: list[list[EpisodeResult]], su
 
 
 def figures(results: dict[str, list[list[EpisodeResult]]]) -> dict[str, Any]:
-    """{version: {suite: the rate of each training}} as JSON."""
+    """Return {version: {suite: rate of each training}} for JSON."""
     return {
         name: {suite: [mean(episode_means([run], suite).values()) for run in runs] for suite in SUITES}
         for name, runs in results.items()

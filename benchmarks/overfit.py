@@ -4,7 +4,7 @@ Eight episodes start alike, to the last pixel, and only the instruction says whi
 policy is trained on them without the robot's state, and evaluated on the same episodes, by LeRobot's own
 commands. Two controls change what the trained policy is shown:
 
-    permuted instructions   each episode is given the instruction of another: the stone must go to the square
+    permuted instructions   each episode is given the instruction of another: the stone must go to the place
                             that is named, so the instruction decides, not the episode
     blank images            the cameras show black: the policy must fail, so it uses what it sees
 
@@ -49,7 +49,7 @@ MAX_MINUTES = 25
 
 @dataclass(frozen=True)
 class Control:
-    """One evaluation of the trained policy and how many of its episodes should do what is counted."""
+    """One evaluation of the trained policy, with the bounds of what is counted over its episodes."""
 
     name: str
     counted: str
@@ -63,7 +63,7 @@ BLANK = Control("blank images", "successes", at_least=0, at_most=2)
 
 
 def main() -> None:
-    """Record, train, evaluate three times, print what was counted; exit code 1 where a bar is missed."""
+    """Record, train, evaluate three times, print what was counted; exit with code 1 if a bar is missed."""
     parser = make_parser(__doc__)
     parser.add_argument("--policy.type", dest="policy_type", required=True, choices=POLICY_TYPES)
     parser.add_argument("--output_dir", type=Path, help="new folder to keep (default: a temporary one)")
@@ -90,7 +90,7 @@ def main() -> None:
 
 
 def prove(args: argparse.Namespace, folder: Path) -> int:
-    """The whole proof in `folder`; 0 if every bar was reached."""
+    """Run the whole proof in `folder`; return 0 if every bar was reached."""
     started = time.monotonic()
     images = DEPTH_PICTURES if args.depth else PICTURES
     record(folder / "dataset", images)
@@ -113,7 +113,7 @@ def prove(args: argparse.Namespace, folder: Path) -> int:
 
 
 def record(dataset: Path, images: Iterable[str] = PICTURES) -> None:
-    """Record the expert's episodes: one seed, eight targets; ``images``: flags, without their dashes."""
+    """Record the expert's episodes of one seed and eight targets; ``images``: flags, without their dashes."""
     run_command(
         "lerobot-bomb",
         "record",
@@ -128,7 +128,7 @@ def record(dataset: Path, images: Iterable[str] = PICTURES) -> None:
 
 
 def read_instructions(dataset: Path) -> dict[int, str]:
-    """{task id: instruction}; leaves with exit code 1 unless all episodes begin with the same frame."""
+    """Return {task id: instruction}; exit with code 1 unless all episodes begin with the same frame."""
     from lerobot.datasets import LeRobotDataset
 
     frames: Any = LeRobotDataset(REPO_ID, root=dataset, video_backend="pyav")
@@ -141,7 +141,7 @@ def read_instructions(dataset: Path) -> dict[int, str]:
 
 
 def train(args: argparse.Namespace, folder: Path) -> Path:
-    """Stock `lerobot-train` on the recipe; the checkpoint's folder."""
+    """Train the recipe by stock `lerobot-train`; return the checkpoint's folder."""
     override = [f"--steps={args.steps}"] if args.steps else []
     run_command(
         "lerobot-train",
@@ -156,7 +156,7 @@ def train(args: argparse.Namespace, folder: Path) -> Path:
 
 
 def change_what_is_shown(checkpoint: Path, replacements: dict[str, str]) -> dict[Control, Path]:
-    """The controls' checkpoints: the trained weights behind a preprocessor that intervenes."""
+    """Write the controls' checkpoints: the trained weights behind a preprocessor that intervenes."""
     from lerobot_bomb.explain.interventions import BlankImages, ReplaceTasks, intervene
 
     steps = {PERMUTED: ReplaceTasks(replacements), BLANK: BlankImages()}
@@ -168,7 +168,7 @@ def change_what_is_shown(checkpoint: Path, replacements: dict[str, str]) -> dict
 
 
 def evaluate(checkpoint: Path, output_dir: Path, images: Iterable[str]) -> dict[int, EpisodeResult]:
-    """Stock `lerobot-eval` on the recorded seed, one episode a task; {task id: result}."""
+    """Run stock `lerobot-eval` on the recorded seed, one episode per task; return {task id: result}."""
     run_command(
         "lerobot-eval",
         f"--policy.path={checkpoint}",
@@ -215,7 +215,7 @@ def print_episodes(condition: Control, rows: dict[int, EpisodeResult]) -> None:
 def report(
     args: argparse.Namespace, counts: dict[Control, int], minutes: float, minutes_to_checkpoint: float
 ) -> int:
-    """Print what was counted against its bar; 0 if every bar was kept."""
+    """Print what was counted against its bar; return 0 if every bar was kept."""
     rows, missed = [], []
     for condition, count in counts.items():
         is_kept = condition.at_least <= count <= condition.at_most
@@ -247,7 +247,7 @@ def report(
 
 
 def verdict(is_kept: bool) -> str:
-    """A word for the table."""
+    """Return the table's word for a bar that is kept or missed."""
     return "ok" if is_kept else "MISSED"
 
 

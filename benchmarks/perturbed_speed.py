@@ -54,7 +54,7 @@ cpu_milliseconds = partial(milliseconds, clock=time.process_time)
 
 
 def conditions(axes: Any) -> list[str]:
-    """Each axis at its highest level, and all of them."""
+    """Return each axis at its highest level, then all axes together."""
     return [*(f"{axis}:{MAX_LEVEL}" for axis in axes), ALL]
 
 
@@ -73,7 +73,7 @@ def main() -> None:
 
 
 def row(resets: list[float], stock_resets: list[float], steps: list[float], stock_steps: list[float]) -> dict:
-    """Medians of a condition, each with its ratio to those beside it."""
+    """Return a condition's median milliseconds, each with its ratio to the stock median."""
     times = {"reset": (median(resets), median(stock_resets)), "step": (median(steps), median(stock_steps))}
     return {
         f"{name}_{figure}": value
@@ -83,12 +83,12 @@ def row(resets: list[float], stock_resets: list[float], steps: list[float], stoc
 
 
 def seeded_actions(seed: int, num_dims: int) -> np.ndarray:
-    """(NUM_STEPS, num_dims) of noise."""
+    """Draw random actions (NUM_STEPS, num_dims)."""
     return np.random.default_rng(seed).uniform(-0.3, 0.3, (NUM_STEPS, num_dims)).astype(np.float32)
 
 
 def measure_bomb(num_episodes: int) -> Rows:
-    """Each condition beside the unperturbed environment, in turn with it."""
+    """Time each condition in turn with the unperturbed environment."""
     figures = {}
     for condition in conditions(AXES):
         envs = [BombEnv(EpisodeSpec(0, perturbations=name), RenderOptions()) for name in (condition, NONE)]
@@ -109,7 +109,7 @@ def measure_bomb(num_episodes: int) -> Rows:
 
 
 def measure_pusht(num_episodes: int) -> Rows:
-    """Resets of each condition beside gym-pusht's own."""
+    """Time the resets of each condition beside gym-pusht's own."""
     stock = gymnasium.make("gym_pusht:gym_pusht/PushT-v0", obs_type="pixels_agent_pos").unwrapped
     names = [NONE, *conditions(PUSHT_AXES)]
     envs = [make_pusht_env(PushTSpec(0, perturbations=name), IMAGE_SIZE).unwrapped for name in names]
@@ -127,7 +127,7 @@ def measure_pusht(num_episodes: int) -> Rows:
 
 
 def measure_libero(num_episodes: int) -> Rows:
-    """Each condition beside LeRobot's `libero`."""
+    """Time each condition beside LeRobot's `libero`."""
     prepare_libero([LIBERO_SUITE])
     from lerobot.envs.factory import make_env as make_stock
     from lerobot.envs.factory import make_env_config

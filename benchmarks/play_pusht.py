@@ -2,8 +2,8 @@ r"""Comparison on PushT: our policies and LeRobot's `act` and `diffusion`, train
 
 Each starts from random weights and is trained by the stock `lerobot-train` on the 206 human demonstrations
 and copies of them that are turned, mirrored and shifted; the stock `lerobot-eval --env.type=pusht` runs it
-on new seeds. Two short trainings find what a step takes, so that the learning rate ends its decay when the
-minutes do: of CPU on a CPU, by the clock on a GPU.
+on new seeds. Two short trainings measure a step, so that the learning rate's decay ends when the minutes do:
+CPU minutes on a CPU, wall-clock minutes on a GPU.
 
     python benchmarks/play_pusht.py --source pusht_cchi_v7_replay.zarr --output_dir play --minutes 60
     python benchmarks/play_pusht.py --source ... --output_dir play --minutes 15 --device cuda --jobs 7
@@ -46,13 +46,13 @@ class Seconds:
     cpu: float
 
     def on(self, device: str) -> float:
-        """Return the seconds that are made equal on a device."""
+        """Return the seconds that count on a device: of CPU on a CPU, else by the clock."""
         return self.cpu if device == "cpu" else self.clock
 
 
 @dataclass(frozen=True)
 class Contender:
-    """Contender: how one policy was trained, and how it performs."""
+    """One policy: how it was trained, and how it performs."""
 
     name: str
     steps: int
@@ -104,20 +104,20 @@ def compete(args: argparse.Namespace, name: str, dataset: Path) -> Contender:
 
 
 def decay(name: str, steps: int) -> list[str]:
-    """The learning rate's, over the whole training, where the policy's config says how long it is."""
+    """Return the flag that decays the learning rate over the whole training, if the config has one."""
     flag = "scheduler_decay_steps"
     return [f"--policy.{flag}={steps}"] if flag in read_recipe("play_pusht", name)["policy"] else []
 
 
 def step_s(folder: Path, flags: list[str], device: str) -> float:
-    """Seconds of a training step, of CPU where it trains on a CPU: what a longer training takes more."""
+    """Return the seconds of a training step, CPU seconds on a CPU: what each further step takes."""
     few, more = CALIBRATION_STEPS[device]
     shorter, longer = (train(folder / f"calibration_{steps}", flags, steps) for steps in (few, more))
     return (longer.on(device) - shorter.on(device)) / (more - few)
 
 
 def train(output_dir: Path, flags: list[str], steps: int) -> Seconds:
-    """Stock `lerobot-train`."""
+    """Run stock `lerobot-train`; return the seconds that it took."""
     started = time.monotonic()
     cpu = run_logged(
         output_dir.with_suffix(".log"),
@@ -131,7 +131,7 @@ def train(output_dir: Path, flags: list[str], steps: int) -> Seconds:
 
 
 def coverages_of(folder: Path, episodes: int) -> tuple[list[float], int]:
-    """Maximal coverage of each episode, and the successes."""
+    """Return the maximal coverage of each episode, and the number of successes."""
     checkpoint = last_checkpoint(folder / "train")
     flags = [f"--seed={FIRST_UNSEEN_SEED}", f"--eval.n_episodes={episodes}"]
     flags.append(f"--eval.batch_size={min(50, episodes)}")

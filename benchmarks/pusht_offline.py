@@ -5,8 +5,8 @@ The recipe configs/pusht_TYPE.yaml and its variants, each with several seeds, ar
 episodes 180-205, beside predictors that look at no image. With --eval_episodes the recipe's checkpoints also
 run in LeRobot's environment `pusht`.
 
-All start from one small backbone that has learned to see before, on the same episodes: from random weights, a
-model that may read the state does not look at the image for a long time (docs/pusht.md).
+All start from one small backbone that first learned to see on the same episodes. From random weights, a model
+that may read the state ignores the image for a long time (docs/pusht.md).
 
     python benchmarks/pusht_offline.py --policy.type=vla0_smol --source pusht_cchi_v7_replay.zarr \
         --output_dir pusht
@@ -93,12 +93,12 @@ class Run:
         return self.folder / "training.json"
 
     def times(self) -> dict[str, float]:
-        """Minutes that the training took, by the clock and of CPU."""
+        """Return the training's wall-clock and CPU minutes."""
         return json.loads(self.times_path.read_text())
 
 
 def main() -> None:
-    """Convert, train, measure, print the tables; exit code 1 where the recipe does not beat a predictor."""
+    """Convert, train, measure, print the tables; exit with code 1 if a predictor beats the recipe."""
     parser = make_parser(__doc__)
     parser.add_argument("--policy.type", dest="policy_type", required=True, choices=PUSHT_TYPES)
     parser.add_argument("--source", type=Path, help="the zarr; not needed once it is converted")
@@ -125,7 +125,7 @@ def main() -> None:
 
 
 def prove(args: argparse.Namespace, chosen: list[str]) -> dict[str, list[Seed]]:
-    """{variant: what was measured of each of its seeds}."""
+    """Train and measure the chosen variants, {variant: one `Seed` for each seed}."""
     dataset = convert(args.source, args.output_dir / "dataset")
     start = learn_to_see(args.policy_type, dataset, args.output_dir)
     runs = [
@@ -149,12 +149,12 @@ def prove(args: argparse.Namespace, chosen: list[str]) -> dict[str, list[Seed]]:
 
 
 def as_figures(variants: dict[str, list[Seed]]) -> dict[str, list[dict[str, Any]]]:
-    """JSON-ready."""
+    """Return the figures ready for JSON."""
     return {name: [asdict(seed) for seed in seeds] for name, seeds in variants.items()}
 
 
 def convert(source: Path | None, dataset: Path, copies: int = 0) -> Path:
-    """The demonstrations as a LeRobotDataset, and so many rigid copies of each."""
+    """Convert the demonstrations, and so many rigid copies of each, to a LeRobotDataset in a folder."""
     if not dataset.exists():
         if source is None:
             raise RuntimeError(f"{dataset} does not exist yet; name the demonstrations with --source")
@@ -165,7 +165,7 @@ def convert(source: Path | None, dataset: Path, copies: int = 0) -> Path:
 
 
 def learn_to_see(policy_type: str, dataset: Path, folder: Path) -> list[str]:
-    """Flags that start a training from the backbone that has learned to see."""
+    """Train a backbone to see; return the flags that start a training from it."""
     start: list[str] = []
     for stage, flags in enumerate(BASE_STAGES[policy_type]):
         run = Run("base", 0, folder / f"base_{stage}")
@@ -219,13 +219,13 @@ def measure(run: Run, dataset: Path, num_frames: int) -> dict[str, Any]:
 
 
 def coverages_of(run: Run, num_episodes: int) -> list[float]:
-    """Maximal coverage of each episode."""
+    """Return the maximal coverage of each episode."""
     flags = [f"--eval.n_episodes={num_episodes}", "--eval.batch_size=10"]
     return max_coverages(evaluate(run.checkpoint, run.folder / f"eval_{num_episodes}", flags))
 
 
 def evaluate(checkpoint: Path, output_dir: Path, flags: list[str]) -> list[dict[str, Any]]:
-    """Stock `lerobot-eval --env.type=pusht`; its metrics of each task."""
+    """Run stock `lerobot-eval --env.type=pusht`; return the metrics of each task."""
     info = output_dir / "eval_info.json"
     if not info.exists():
         shutil.rmtree(output_dir, ignore_errors=True)
@@ -247,7 +247,7 @@ def max_coverages(metrics: list[dict[str, Any]]) -> list[float]:
 
 
 def run_logged(log: Path, command: str, *flags: str) -> float:
-    """Run a command of this Python's environment, its output to a file; CPU seconds of all its processes."""
+    """Run a command of this Python's environment, log its output; return its processes' CPU seconds."""
     log.parent.mkdir(parents=True, exist_ok=True)
     print(f"{log.parent.name}: {command} {' '.join(flags[:2])} ... > {log}", flush=True)
     with log.open("w") as output:

@@ -38,7 +38,7 @@ class Seed:
 
 
 def print_report(variants: dict[str, list[Seed]], recipe: str) -> bool:
-    """Print everything; whether each seed of the recipe has a smaller L1 than every trivial predictor."""
+    """Print the tables; return True if every seed of the recipe has a smaller L1 than all predictors."""
     names = [
         name
         for name in ("loss", "token_accuracy", "value_accuracy")
@@ -66,7 +66,7 @@ def print_report(variants: dict[str, list[Seed]], recipe: str) -> bool:
 
 
 def over_seeds(values: Sequence[float]) -> str:
-    """Mean, and its t-interval where there are several."""
+    """Format the mean, with its t-interval if there are several values."""
     mean, precision = fmean(values), 3 if abs(fmean(values)) < 3 else 1
     if len(values) not in T_QUANTILES:
         return f"{mean:.{precision}f}"
@@ -75,14 +75,14 @@ def over_seeds(values: Sequence[float]) -> str:
 
 
 def over_episodes(values: Sequence[float]) -> str:
-    """Mean and its bootstrap interval."""
+    """Format the mean and its bootstrap interval."""
     interval = bootstrap_interval(np.array(values), np.ones(len(values)))
     text = "" if interval is None else f" [{interval[0]:.3f}, {interval[1]:.3f}]"
     return f"{fmean(values):.3f}{text} over {len(values)} episodes"
 
 
 def _print_steps(variants: dict[str, list[Seed]]) -> None:
-    """Print L1 by step of the chunk: of each variant, the mean over seeds; of trivial predictors."""
+    """Print L1 by step of the chunk, of each variant (mean over seeds) and each trivial predictor."""
     first = _any(variants)
     rows = {
         name: (fmean(seed.l1() for seed in seeds), np.mean([seed.l1_by_step() for seed in seeds], axis=0))

@@ -12,7 +12,7 @@ INSTRUCTIONS = "put the black stone on the center", "go", "push the white stone 
 
 
 def features(num_dims: int, image_size: int, *, has_state: bool = True) -> dict[str, Any]:
-    """Config fields of a policy that sees two cameras; state and action have as many dimensions."""
+    """Return config fields of a policy with two cameras and `num_dims` state and action dimensions."""
     inputs = dict.fromkeys(CAMERAS, PolicyFeature(FeatureType.VISUAL, (3, image_size, image_size)))
     state = {STATE: PolicyFeature(FeatureType.STATE, (num_dims,))} if has_state else {}
     outputs = {ACTION: PolicyFeature(FeatureType.ACTION, (num_dims,))}
@@ -20,7 +20,7 @@ def features(num_dims: int, image_size: int, *, has_state: bool = True) -> dict[
 
 
 def make_batches(policy: Any, batch_size: int, num_batches: int) -> list[dict[str, Any]]:
-    """Preprocessed observations of noise, the instructions of different lengths."""
+    """Return preprocessed random observations with instructions of different lengths."""
     num_dims = policy.config.output_features[ACTION].shape[0]
     ends = {"min": -1.0, "max": 1.0, "mean": 0.0, "std": 1.0}
     stats = {name: torch.full((num_dims,), value) for name, value in ends.items()}

@@ -1,4 +1,4 @@
-"""The policies that learn, and the recipes with which small ones of each do so on a CPU."""
+"""Policy types that learn, and the recipes that train a small one of each on a CPU."""
 
 from pathlib import Path
 from typing import Any
@@ -6,19 +6,19 @@ from typing import Any
 import yaml
 
 FOLDER = Path(__file__).parents[1] / "configs"
-# a policy that learns comes with such a file; every proof runs on all of them
+# every policy type that learns comes with such a file; every proof runs on all of them
 POLICY_TYPES = sorted(path.stem.removeprefix("overfit_") for path in FOLDER.glob("overfit_*.yaml"))
-# and those that learn PushT with such a file
+# policy types with a recipe for PushT
 PUSHT_TYPES = sorted(path.stem.removeprefix("pusht_") for path in FOLDER.glob("pusht_*.yaml"))
 
 
 def recipe_path(task: str, policy_type: str) -> Path:
-    """A config for `lerobot-train --config_path`; task: overfit, one_target, all_targets, pusht and so on."""
+    """Return the config of a recipe; tasks: overfit, one_target, all_targets, pusht, ..."""
     return FOLDER / f"{task}_{policy_type}.yaml"
 
 
 def read_recipe(task: str, policy_type: str) -> dict[str, Any]:
-    """The recipe's values."""
+    """Read a recipe's values."""
     return yaml.safe_load(recipe_path(task, policy_type).read_text())
 
 

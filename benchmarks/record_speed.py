@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def successes(recording: Recording) -> list[Rollout]:
-    """The successful rollouts that the recording will hold."""
+    """Collect the successful rollouts that the recording will hold."""
     env = make_env(recording.suite_specs[0], recording.render_options)
     settings = RolloutSettings(recording.render_options)
     rollouts: list[Rollout] = []

@@ -5,7 +5,7 @@ at its default control rate. Every environment is measured in processes of its o
 
     OMP_NUM_THREADS=1 python benchmarks/sim_speed.py --json sim_speed.json
 
-robosuite pins packages that LeRobot does not bear, so it gets an environment of its own:
+robosuite pins packages that conflict with LeRobot's, so it gets an environment of its own:
     python -m venv robosuite-venv && robosuite-venv/bin/pip install robosuite==1.5.2 mujoco==3.8.1
     python benchmarks/sim_speed.py --robosuite_python robosuite-venv/bin/python
 """
@@ -63,7 +63,7 @@ def main() -> None:
 
 
 def compare_environments(repeats: int, robosuite_python: str) -> dict[str, dict[str, float]]:
-    """{environment: {"frame" or "step": median milliseconds}}; an absent peer is left out."""
+    """Return {environment: {"frame" or "step": median milliseconds}}; an absent peer is left out."""
     pythons = {"bomb": sys.executable, "fetch": sys.executable, "lift": robosuite_python}
     runs: dict[str, list[dict[str, float]]] = {name: [] for name in pythons}
     for _ in range(repeats):
@@ -79,7 +79,7 @@ def compare_environments(repeats: int, robosuite_python: str) -> dict[str, dict[
 
 
 def run_in_process(command: list[str], allow_failure: bool = False) -> dict[str, float] | None:
-    """The JSON on the last line that a command prints; None when it failed and may."""
+    """Run a command, return the JSON on its last line; None if it fails and may."""
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode == 0:
         return json.loads(done.stdout.splitlines()[-1])
@@ -97,7 +97,7 @@ def median_ms(action: Callable[[], object], number: int) -> float:
 
 
 def make_bomb():
-    """BOMB with its default spec, reset."""
+    """Make BOMB with its default spec, and reset it."""
     import gymnasium
 
     env = gymnasium.make("lerobot_env_bomb:bomb/place-v0", disable_env_checker=True)
@@ -156,7 +156,7 @@ MEASURES = {"bomb": measure_bomb, "fetch": measure_fetch, "lift": measure_lift}
 
 
 def worker_rate(num_workers: int) -> float:
-    """Steps per second, with two cameras, of so many processes at once."""
+    """Return the steps per second, with two cameras, of this many processes at once."""
     context = multiprocessing.get_context("spawn")
     barrier, queue = context.Barrier(num_workers), context.Queue()
     workers = [context.Process(target=run_steps, args=(barrier, queue)) for _ in range(num_workers)]
@@ -169,7 +169,7 @@ def worker_rate(num_workers: int) -> float:
 
 
 def run_steps(barrier, queue) -> None:
-    """Put the seconds that the steps took; workers start together."""
+    """Put the seconds that the steps took into the queue; workers start together."""
     env = make_bomb()
     env.step([0.0, 0.0, 0.2, 1.0])
     barrier.wait(timeout=120)
@@ -206,7 +206,7 @@ def report(figures: dict) -> None:
 
 
 def bars(figures: dict) -> dict[str, bool]:
-    """Ratios beside the bars that they must keep."""
+    """Return {ratio and its bar, in words: True if the bar is kept}."""
     ms, rate, start_s = figures["milliseconds"], figures["steps_per_s"], figures["start_s"]["ours"]
     frame, workers = ms["bomb"]["frame"] / ms["fetch"]["frame"], rate["2"] / rate["1"]
     kept = {

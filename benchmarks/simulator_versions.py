@@ -36,7 +36,7 @@ HASH_DIGITS = 8  # shown of a hash
 
 @dataclass(frozen=True)
 class Outcome:
-    """The expert's episodes of one robot under one condition."""
+    """Outcome of the expert's episodes of one robot under one condition."""
 
     states: str  # SHA-256
     images: str  # SHA-256
@@ -66,7 +66,7 @@ def measure_here(conditions: Iterable[str], seeds: range) -> Measured:
 
 
 def outcome_of(robot: str, condition: str, seeds: range) -> Outcome:
-    """The expert's episodes of these seeds."""
+    """Run the expert on these seeds."""
     from lerobot_bomb.bomb.episode import EpisodeSpec
     from lerobot_bomb.bomb.observation import PIXELS, RenderOptions
     from lerobot_bomb.envs.rollout import expert_agent, run_episode
@@ -93,7 +93,7 @@ def outcome_of(robot: str, condition: str, seeds: range) -> Outcome:
 
 
 def renderer_name() -> str:
-    """Return what OpenGL says it draws with."""
+    """Return the name of OpenGL's renderer."""
     from lerobot_env_bomb.env import BombEnv
 
     env = BombEnv()
@@ -129,7 +129,7 @@ def from_dict(figures: dict) -> Measured:
 
 
 def table(measured: Sequence[Measured]) -> list[str]:
-    """Markdown: a row per version and robot; hashes over all conditions, `=` where the first version's."""
+    """Return Markdown, a row per version and robot; `=` marks a hash equal to the first version's."""
     reference = measured[0]
     conditions = list(dict.fromkeys(case.split()[1] for case in reference.outcomes))
     lines = [

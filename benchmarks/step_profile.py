@@ -78,7 +78,7 @@ def main() -> None:
 
 
 def recipe(policy_type: str, dataset: Path, dtype: str = "float32") -> TrainPipelineConfig:
-    """The training config of configs/overfit_TYPE.yaml for this dataset, as `lerobot-train` reads it."""
+    """Read configs/overfit_TYPE.yaml for this dataset, as `lerobot-train` does."""
     values = read_recipe("overfit", policy_type)
     values["policy"]["dtype"] = dtype
     values["dataset"] |= {"root": str(dataset), "video_backend": "pyav"}
@@ -88,7 +88,7 @@ def recipe(policy_type: str, dataset: Path, dtype: str = "float32") -> TrainPipe
 def profile_training(
     cfg: TrainPipelineConfig, policy: Any, preprocessor: Callable, dataset: Any, repeats: int
 ) -> dict[str, float]:
-    """Stages of a training step in milliseconds, as `lerobot-train` runs it with `--num_workers=0`."""
+    """Time the stages of a training step, in milliseconds, as of `lerobot-train --num_workers=0`."""
     optimizer: Any = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     policy.train()
     generator = torch.Generator().manual_seed(0)
@@ -123,7 +123,7 @@ def profile_training(
 def profile_evaluation(
     cfg: TrainPipelineConfig, policy: Any, processors: tuple[Any, Any], repeats: int
 ) -> dict[str, float]:
-    """Stages of an evaluation step in milliseconds, as `lerobot-eval` runs it."""
+    """Time the stages of an evaluation step, in milliseconds, as of `lerobot-eval`."""
     env_config = make_env_config("bomb", image_size=IMAGE_SIZE)
     env: Any = make_env(env_config, n_envs=1)["place"][0]
     env_preprocessor, _ = make_env_pre_post_processors(env_cfg=env_config, policy_cfg=cfg.policy)

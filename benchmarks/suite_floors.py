@@ -1,11 +1,11 @@
-"""Success rates that policies which miss something would reach on a suite, to read a rate by.
+"""Success rates on a suite of policies that lack one ability, to compare a measured rate with.
 
     python benchmarks/suite_floors.py --json suite_floors.json
 
-Each of them is taken to move perfectly what it has chosen; nothing is simulated. `most likely` neither
-reads nor sees: it does what is right most often. `no instruction` sees the board and takes anything that
-could be asked for there. `no colours` reads and sees everything but the stones' colours: it takes what the
-instruction means under colours drawn at random, such that it means something.
+Each is assumed to carry out its choice perfectly; nothing is simulated. `most likely` neither reads nor sees:
+it does what is right most often. `no instruction` sees the board and takes anything that could be asked for
+there. `no colours` reads and sees everything but the stones' colours: it does what the instruction means
+under random colours, drawn until it means something.
 """
 
 from collections import Counter
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def floors_of(suite: str) -> Callable[[Sequence[int]], Floors]:
-    """Success rates on a suite's seeds, by what is missing."""
+    """Return the function from seeds to a suite's success rates, by missing ability."""
     if suite in COMMANDS:
         return partial(floors_of_commands, suite, COMMANDS[suite])
     return partial(floors_of_places, suite)
@@ -90,7 +90,7 @@ def floors_of_commands(suite: str, tasks: Sequence[Task], seeds: Sequence[int]) 
         task_id, drawn, case = draw_command(tasks, EpisodeSpec(seed, suite))
         of_tasks = np.array([share_of_guesses(task, drawn, case, rng) for task in tasks])
         if np.isnan(of_tasks[task_id]):
-            of_tasks[task_id] = 0.0  # it could be about too many things for one that makes sense to be met
+            of_tasks[task_id] = 0.0  # the verb can be about so many things that no guess fits this board
         shares.append(of_tasks)
         colourless.append(float(plans_without_colours(tasks[task_id], drawn, rng) == case.plans))
     each = np.array(shares)  # (episodes, tasks), nan: the verb makes no sense there
@@ -103,7 +103,7 @@ def floors_of_commands(suite: str, tasks: Sequence[Task], seeds: Sequence[int]) 
 
 
 def share_of_guesses(task: Task, drawn: TaskInstance, case: Case, rng: np.random.Generator) -> float:
-    """Return the share of a verb's possible meanings there that ask for the same; nan: none fits."""
+    """Return the share of a verb's possible meanings on this board with the same plans; NaN if none fits."""
     abouts = {task.draw(rng).about for _ in range(NUM_GUESSES)}
     guesses = [task.case(replace(drawn, about=about)) for about in sorted(abouts)]
     fitting = [guess for guess in guesses if guess is not None]
@@ -111,7 +111,7 @@ def share_of_guesses(task: Task, drawn: TaskInstance, case: Case, rng: np.random
 
 
 def plans_without_colours(task: Task, drawn: TaskInstance, rng: np.random.Generator) -> tuple | None:
-    """Return what a command asks for under other stone colours; None: nothing under those tried."""
+    """Return a command's plans under random stone colours; None if it has none under those tried."""
     for _ in range(MAX_TRIES):
         supply = tuple(COLORS[i] for i in rng.integers(2, size=len(drawn.supply)))
         pattern = recoloured(drawn.pattern, rng)
@@ -131,7 +131,7 @@ def legal(episode: Episode, stone: int) -> list[Intersection]:
 
 
 def answer_without_colours(episode: Episode, rng: np.random.Generator) -> tuple[int, Intersection | None]:
-    """(stone, place) that the instruction means where the stones have other colours."""
+    """Return the (stone, place) that the instruction means under random stone colours."""
     suite, layout = episode.spec.suite, episode.layout
     if suite == "object":
         task, supply = object_suite.TASKS[episode.task_id], list(episode.supply)
@@ -152,7 +152,7 @@ def answer_without_colours(episode: Episode, rng: np.random.Generator) -> tuple[
 
 
 def recoloured(opening: Stones, rng: np.random.Generator) -> dict[Intersection, str]:
-    """The stones on the board in colours drawn at random."""
+    """Return the stones on the board in random colours."""
     return {intersection: COLORS[rng.integers(2)] for intersection in opening}
 
 

@@ -1,8 +1,8 @@
 """Episodes an hour of ``lerobot-bomb sweep`` against stock ``lerobot-eval`` on the same jobs, in one run.
 
-The peer runs the manifest's own commands one after the other, and, in a second row, all conditions in one
-command with LeRobot's default of a process an environment. All must give the same records, or the benchmark
-stops. Times hold everything, the start of Python and the loading of the policy too.
+The peer runs the manifest's own commands one after the other. A second row runs all conditions in one
+command, with LeRobot's default of one process per environment. All rows but that one must give the same
+records, or the benchmark stops. Times include starting Python and loading the policy.
 
     python benchmarks/sweep_speed.py --json sweep_speed.json
 """
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def run_each(manifest: Manifest, folder: Path) -> Path:
-    """Run the command of every job; the file of results."""
+    """Run the command of every job; return the results file."""
     results = folder / "results.jsonl"
     for number, job in enumerate(manifest.jobs):
         run(
@@ -81,7 +81,7 @@ def run_each(manifest: Manifest, folder: Path) -> Path:
 
 
 def run_together(manifest: Manifest, conditions: Sequence[str], folder: Path) -> Path:
-    """Run one command with all conditions."""
+    """Run one command with all conditions; return the results file."""
     results, job = folder / "results.jsonl", manifest.jobs[0]
     replaced = ("--env.perturbations=", "--eval.use_async_envs=")
     flags = [flag for flag in job.flags if not flag.startswith(replaced)]
@@ -91,14 +91,14 @@ def run_together(manifest: Manifest, conditions: Sequence[str], folder: Path) ->
 
 
 def sweep(manifest: Manifest, folder: Path, num_workers: int) -> Path:
-    """Sweep the manifest."""
+    """Sweep the manifest; return the results file."""
     manifest.write(folder)
     run("lerobot-bomb", ["sweep", str(folder), f"--workers={num_workers}"])
     return folder / "results.jsonl"
 
 
 def run(command: str, flags: Sequence[str]) -> None:
-    """Run a command of this environment; leave with its last words if it fails."""
+    """Run a command of this environment; exit with the end of its error output if it fails."""
     path = Path(sys.executable).with_name(command)
     done = subprocess.run([path, *flags], capture_output=True, text=True, check=False)
     if done.returncode:
@@ -106,7 +106,7 @@ def run(command: str, flags: Sequence[str]) -> None:
 
 
 def comparable(rows: list[Record]) -> list[Record]:
-    """Return the records in one order, without what is measured anew, and without which evaluation it was."""
+    """Return the records in one order, without timings and the evaluation's identity."""
     same = [replace(without_measured(each), evaluation=None) for each in rows]
     return sorted(same, key=lambda record: repr(record.spec))
 

@@ -18,7 +18,7 @@ ROUNDING = 1e-9  # that makes no two numbers different
 
 
 def sums_by(values_N: np.ndarray, episode_N: Sequence[Hashable]) -> tuple[np.ndarray, np.ndarray]:
-    """(sums_E, counts_E) of values, by episode."""
+    """Sum and count values by episode: (sums_E, counts_E)."""
     places: dict[Hashable, int] = {}
     place_N = [places.setdefault(episode, len(places)) for episode in episode_N]
     return np.bincount(place_N, weights=values_N), np.bincount(place_N).astype(float)
@@ -27,8 +27,8 @@ def sums_by(values_N: np.ndarray, episode_N: Sequence[Hashable]) -> tuple[np.nda
 def bootstrap_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float, float] | None:
     """95 % percentile bootstrap interval of sum / count over E episodes.
 
-    None for fewer than two, and if all are equal: resampling tells nothing about them. Episodes are drawn,
-    not frames: the frames of one resemble each other.
+    None for fewer than two episodes, or if all means are equal: resampling tells nothing about them. Episodes
+    are drawn, not frames, because an episode's frames resemble each other.
     """
     if _is_constant(sums_E, counts_E):
         return None
@@ -40,7 +40,7 @@ def paired_bootstrap_interval(
 ) -> tuple[float, float] | None:
     """95 % percentile bootstrap interval of the second mean minus the first, drawn together as pairs.
 
-    (sums_E, counts_E) each; None for fewer than two pairs, and where resampling tells nothing.
+    Each argument is (sums_E, counts_E). None for fewer than two pairs, or if all differences are equal.
     """
     if len(first[0]) < 2 or _are_equal(second[0] / second[1] - first[0] / first[1]):
         return None
@@ -50,7 +50,7 @@ def paired_bootstrap_interval(
 def bca_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float, float] | None:
     """95 % bootstrap interval of sum / count over E episodes, corrected for bias and skew.
 
-    None for fewer than two, and where all are equal.
+    None for fewer than two episodes, or if all means are equal.
     Source: Efron (1987), "Better bootstrap confidence intervals" (BCa).
     """
     if _is_constant(sums_E, counts_E):
@@ -68,7 +68,7 @@ def bca_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float, float
 
 
 def format_bounds(interval: tuple[float, float] | None, form: str) -> str:
-    """' [low, high]' in this number format; '' without an interval."""
+    """Format an interval as ' [low, high]'; '' without one."""
     return "" if interval is None else f" [{interval[0]:{form}}, {interval[1]:{form}}]"
 
 
@@ -84,7 +84,7 @@ class Slope:
 def fit_slope(levels_N: np.ndarray, values_N: np.ndarray, episode_N: np.ndarray) -> Slope | None:
     """Fit the slope of N values over their levels, by least squares; None where all levels are the same.
 
-    `episode_N` says which values are of one episode under several conditions: the percentile bootstrap draws
+    `episode_N` names each value's episode, which may have several conditions: the percentile bootstrap draws
     episodes.
     """
     if np.ptp(levels_N) == 0:
@@ -110,8 +110,8 @@ def _least_squares(moments: np.ndarray) -> np.ndarray:
 def variance_share(values_N: np.ndarray, levels_N: np.ndarray) -> float | None:
     """Share of the values' variance that the level alone explains: its first-order sensitivity index.
 
-    Corrected for the number of levels, so that it is 0 on average where the level has no effect, and can be
-    negative. None if it is undefined: all values or all levels are the same.
+    It is corrected for the number of levels, so it is 0 on average where the level has no effect, and can be
+    negative. None if undefined: all values or all levels are the same.
     Source: epsilon squared, Kelley (1935), "An unbiased correlation ratio measure".
     """
     total = float(((values_N - values_N.mean()) ** 2).sum())
@@ -125,7 +125,7 @@ def variance_share(values_N: np.ndarray, levels_N: np.ndarray) -> float | None:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over frames and its 95 % bootstrap interval over episodes; no interval of one episode."""
+    """A mean over frames and its 95 % bootstrap interval over episodes; no interval for one episode."""
 
     mean: float
     low: float | None
@@ -137,7 +137,7 @@ class Estimate:
 
 
 def estimate_mean(values_RX: np.ndarray, episode_R: np.ndarray) -> Estimate:
-    """Mean of all finite numbers (R, ...); every one counts the same."""
+    """Estimate the mean of all finite numbers (R, ...), each with the same weight."""
     values_RX = values_RX.reshape(len(episode_R), -1)
     counts_RX = np.isfinite(values_RX)
     episodes_E, place_R = np.unique(episode_R, return_inverse=True)
@@ -160,7 +160,7 @@ def _are_equal(values: np.ndarray) -> bool:
 
 
 def _resampled_means(sums_E: np.ndarray, counts_E: np.ndarray, number: int) -> np.ndarray:
-    """(number,), with the same draws for the same E."""
+    """Return (number,) resampled means, with the same draws for the same E."""
     sums = _resampled_sums(np.stack([sums_E, counts_E], axis=1), number)
     return sums[:, 0] / sums[:, 1]
 
@@ -182,7 +182,7 @@ def _resampled_sums(values_EM: np.ndarray, number: int) -> np.ndarray:
 
 
 def _percentiles(means: np.ndarray) -> tuple[float, float] | None:
-    """2.5th and 97.5th percentile; None if all are the same, or there is none."""
+    """Return the 2.5th and 97.5th percentile; None if all are the same, or there is none."""
     if not len(means) or _are_equal(means):
         return None
     low, high = np.percentile(means, [2.5, 97.5])

@@ -28,7 +28,7 @@ class Magnitude:
 
 @dataclass(frozen=True)
 class Axis:
-    """One way to make the task harder that leaves all others alone."""
+    """One way to make the task harder, independent of the others."""
 
     summary: str
     changes: tuple[str, ...]  # of a paired episode: images, state, instruction, goal, dynamics
@@ -55,8 +55,8 @@ def nuisances_of(axes: Registry[Axis]) -> tuple[str, ...]:
 class AxisCondition(str):
     """Axes of an environment that are on, each at one level or at a range to draw from per episode.
 
-    It is its own text, in the one spelling that a condition has: "camera:2+light:3". A subclass names the
-    environment's table.
+    It is a string in canonical spelling, such as "camera:2+light:3". A subclass names its environment's table
+    of axes.
     """
 
     axes: ClassVar[Registry[Axis]] = Registry("", {})
@@ -80,15 +80,15 @@ class AxisCondition(str):
 
     @property
     def key(self) -> str:
-        """The condition in lower-case letters, digits, dots and hyphens: "camera-2.light-3", "all-1to5"."""
+        """Condition in lower-case letters, digits, dots and hyphens: "camera-2.light-3", "all-1to5"."""
         return self.replace("-", "to").replace(":", "-").replace("+", ".").replace("_", "-")
 
     @classmethod
     def groups(cls, perturbations: Sequence[str] | str | None, task: str) -> dict[str, Self]:
-        """{key of a group of results: its condition} of --env.perturbations; the task alone where it is None.
+        """Return {key of a group of results: its condition}; only the task's for `perturbations=None`.
 
         Raises:
-            ValueError: it is no list, empty, or names a condition twice.
+            ValueError: `perturbations` is no list, is empty, or names a condition twice.
         """
         if perturbations is None:
             return {task: cls()}
@@ -109,7 +109,7 @@ class AxisCondition(str):
         """Parse conditions; "each:3" stands for every axis at this level, "each:1-5" for every axis at each.
 
         Raises:
-            ValueError: one is malformed, or the levels are none of 1..MAX_LEVEL.
+            ValueError: a condition is malformed, or a level is outside 1..MAX_LEVEL.
         """
         conditions: list[Self] = []
         for text in perturbations:
@@ -128,7 +128,7 @@ class AxisCondition(str):
         return conditions
 
     @classmethod
-    @lru_cache(maxsize=1024)  # of the lines of a file, many have the same
+    @lru_cache(maxsize=1024)  # many lines of a file have the same
     def _parse(cls, text: str) -> tuple[tuple[str, int, int], ...]:
         ranges: dict[str, tuple[int, int]] = {}
         for part in [] if text == NONE else text.split("+"):
@@ -151,7 +151,7 @@ class AxisCondition(str):
 
     @classmethod
     def _parse_part(cls, part: str, text: str) -> tuple[tuple[str, ...], int, int]:
-        """Axes, lowest and highest level of "camera:1-5" or "all:3"; `text` is the whole condition."""
+        """Return axes, lowest and highest level of "camera:1-5" or "all:3"; `text` is the whole condition."""
         match = re.fullmatch(r"([a-z_]+):(-?\d+)(?:-(\d+))?", part)
         if match is None:
             first, second, *_ = cls.axes
@@ -175,11 +175,11 @@ class AxisCondition(str):
 
 
 class PerturbedSpec:
-    """Base of specs, whose `perturbations` is a condition once the spec is made."""
+    """Base of specs whose `perturbations` becomes an `AxisCondition`."""
 
     perturbations: str
 
     @property
     def condition(self) -> AxisCondition:
-        """The axes that are on."""
+        """Axes that are on, with their levels."""
         return cast(AxisCondition, self.perturbations)

@@ -19,9 +19,9 @@ class _Captured:
 class GraphedFunction:
     """A function of tensors that is captured once for each set of their shapes and types.
 
-    It must do the same work every time: no branch on a value, no random number, and all else that it reads
-    stays at its address. What is returned is written over by the next call of the same shapes. Tensors on
-    other devices than CUDA are given to the function itself. A copy has captured nothing.
+    The function must do the same work every time: no branch on a value, no random number, and all else that
+    it reads stays at its address. The next call with the same shapes overwrites the returned tensors. Off
+    CUDA, the function itself is called. A copy has captured nothing.
     """
 
     def __init__(self, function: Callable[..., tuple[Tensor, ...]]):
@@ -63,10 +63,10 @@ class GraphedFunction:
 
 
 class GraphedModel:
-    """A function of tensors that also reads the weights of modules, where these lie.
+    """A function of tensors that also reads the weights of modules in place.
 
-    With autocast, products' weights are cast once in its course. It is captured anew when weights have moved.
-    Arguments are as for `GraphedFunction`.
+    Under autocast, the weights of linear layers are cast once per call. The function is captured anew when
+    weights have moved or the settings differ. Arguments are as for `GraphedFunction`.
     """
 
     def __init__(self, function: Callable[..., tuple[Tensor, ...]], modules: Iterable[nn.Module]):
@@ -107,7 +107,7 @@ class _Call(nn.Module):
 
 @contextmanager
 def _without_cached_casts() -> Iterator[None]:
-    """Autocast's cache holds what is cast in a capture, or was before it, no longer than autocast lasts."""
+    """Turn off autocast's cache during a capture: its casts live no longer than autocast does."""
     was_enabled = torch.is_autocast_cache_enabled()
     torch.clear_autocast_cache()
     torch.set_autocast_cache_enabled(False)

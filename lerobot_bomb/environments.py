@@ -1,4 +1,4 @@
-"""Environments: LeRobot's env types of which the tools know more than success and rewards."""
+"""Registry of the env types about which the tools know more than success and rewards."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ STOCK = "lerobot_bomb.results.stock:stock_result"
 
 @dataclass(frozen=True)
 class EnvType:
-    """An env type, and its parts as "module:name", each of which is imported when it is asked for.
+    """An env type and its parts, each given as "module:name" and imported on use.
 
-    One that is not registered has what LeRobot tells of every episode: EnvType("aloha").
+    A type that is not registered has only what LeRobot reports of every episode: EnvType("aloha").
     """
 
     name: str  # of --env.type
@@ -25,12 +25,12 @@ class EnvType:
 
     @property
     def record(self) -> Any:
-        """The type of its records of results."""
+        """Type of its episodes' records."""
         return resolve_name(self.record_at) if self.record_at else resolve_name(STOCK)(self.name)
 
     @property
     def view(self) -> Any:
-        """The view of its episodes."""
+        """View of its episodes."""
         return resolve_name(self.view_at)()
 
     def check(self, tasks: Iterable[str] = ()) -> None:

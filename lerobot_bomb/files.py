@@ -1,4 +1,4 @@
-"""Files that may be damaged, that appear complete, and to which several processes append."""
+"""Files: read though they may be damaged, written whole or not at all, appended to by several processes."""
 
 import errno
 import json
@@ -20,11 +20,11 @@ MAX_NAME = 100  # characters of a file's name that is made of a text
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object from a file.
+    """Read a JSON object from a file.
 
     Raises:
-        FileNotFoundError: there is none.
-        ValueError: it is something else, truncated, or nested too deep.
+        FileNotFoundError: there is no such file.
+        ValueError: the file holds something else, is truncated, or is nested too deep.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path.parent} has no {path.name}")
@@ -41,7 +41,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def _check_depth(values: Any, levels: int) -> None:
-    """Raise a RecursionError if lists and objects go deeper."""
+    """Raise a RecursionError if lists and objects are nested deeper than `levels`."""
     if not isinstance(values, dict | list):
         return
     if levels == 0:
@@ -53,7 +53,7 @@ def _check_depth(values: Any, levels: int) -> None:
 def file_names(texts: Sequence[str]) -> list[str]:
     """Return a different file name for each text, of letters, digits, '_', '-' and '.', whatever the case.
 
-    None begins with a '.', so that none is hidden, or stands for the folder or the one above.
+    No name begins with a '.', so none is hidden, and none is '.' or '..'.
     """
     names: list[str] = []
     for text in texts:
@@ -82,10 +82,10 @@ def check_new_folder(flag: str, path: Path) -> None:
 def written_whole(*paths: Path) -> Iterator[list[Path]]:
     """Yield paths to write to; if nothing is raised, the files get the names `paths`.
 
-    All lie in one folder, which is created. What a kill leaves is in a hidden folder there.
+    All lie in one folder, which is created. A process that is killed leaves a hidden folder there.
 
     Raises:
-        OSError: of a full disk, with the way out; what lay at these paths before is still there.
+        OSError: the disk is full; names the way out. Earlier files at these paths are still there.
     """
     folder = paths[0].parent
     try:
@@ -111,7 +111,7 @@ def written_whole(*paths: Path) -> Iterator[list[Path]]:
 
 
 def _sync(path: Path) -> None:
-    """Have a file, or a folder's list of names, on the disk."""
+    """Flush a file, or a folder's list of names, to the disk."""
     file = os.open(path, os.O_RDONLY)
     try:
         os.fsync(file)
@@ -125,10 +125,10 @@ def _sync(path: Path) -> None:
 def append_line(path: Path | str, line: str) -> None:
     r"""Add a line, all of it or nothing, to a file that other processes append to as well.
 
-    It starts on a line of its own, even where something left the last one without its "\n".
+    It starts a new line, even if the file does not end with "\n".
 
     Raises:
-        OSError: the disk is full, or the file cannot be written; it holds whole lines then.
+        OSError: the disk is full, or the file cannot be written; it still holds whole lines.
     """
     file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
     try:

@@ -1,4 +1,4 @@
-"""Numbers that are NaN, infinite or no image's are an error that says where; one definition for all of us."""
+"""Checks for NaN, infinite numbers and images outside [0, 1]; the errors say where."""
 
 import math
 from collections.abc import Mapping
@@ -9,15 +9,15 @@ import torch
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_PREFIX
 from torch import Tensor, nn
 
-# how far outside [0, 1] an image may be: rounding of whoever resized it, a quarter of a grey level
+# how far outside [0, 1] an image may be: a quarter of a grey level, for the rounding of a resize
 IMAGE_TOLERANCE = 1e-3
 
 
 def is_finite(values: Tensor) -> bool:
     """Return True if no value is NaN or infinite; for a tensor on CUDA the host waits.
 
-    A sum of values that are not finite never is, so the values are looked at one by one, which takes 30
-    times as long, only where the sum overflows or something is wrong.
+    A sum with a term that is not finite is not finite either. So the values are checked one by one, which
+    takes 30 times as long, only if their sum is not finite.
     """
     return bool(_readable(values).sum().isfinite()) or not bool(_bad(values).any())
 
@@ -39,7 +39,7 @@ def _bad(values: Tensor) -> Tensor:
 
 
 def _readable(values: Tensor) -> Tensor:
-    """Torch computes nothing with 8 bit floats."""
+    """Return 8-bit floats as float32, because torch cannot compute with them."""
     return values.float() if values.is_floating_point() and values.element_size() == 1 else values
 
 
@@ -71,7 +71,7 @@ def require_finite_statistics(statistics: Mapping[str, Mapping[str, Any]] | None
 def require_finite_rows(values_NX: np.ndarray | Tensor, failure: str, name: str) -> None:
     """Raise a ValueError with the number of rows that are not finite and the first one's index and values.
 
-    ``failure``: what cannot be done; ``name``: of the rows.
+    ``failure`` says what cannot be done, ``name`` what the rows are.
     """
     values_NX = values_NX if isinstance(values_NX, Tensor) else torch.from_numpy(values_NX.copy())
     if is_finite(values_NX):
@@ -87,7 +87,7 @@ def require_finite_rows(values_NX: np.ndarray | Tensor, failure: str, name: str)
 def require_finite_answers(finite_B: Tensor, rows_B: Tensor | None = None) -> None:
     """Raise a ValueError with the rows of a batch for which a model gave numbers that are not finite.
 
-    ``rows_B``: which rows they are. On CUDA the host waits for the device.
+    ``rows_B``: their numbers in the batch, if other than 0..B-1. On CUDA the host waits for the device.
     """
     if bool(finite_B.all()):
         return
@@ -127,7 +127,7 @@ def _is_unit(low: float, high: float) -> bool:
 
 
 def _ends(key: str, values: Tensor) -> Tensor:
-    """(2,) least and greatest value of an image, NaN if one is; of other numbers their sum, twice."""
+    """Return (2,): an image's least and greatest value, NaN if any is; of other numbers the sum, twice."""
     if _is_image(key, values) and values.numel():
         return torch.stack(torch.aminmax(_readable(values)))
     return values.sum().expand(2)

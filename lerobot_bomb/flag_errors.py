@@ -12,15 +12,15 @@ from draccus.utils import DecodingError
 class FlagError(DecodingError):
     """A config's flag has a value that is not allowed.
 
-    LeRobot's commands print such an error in one line, whether the value came from a flag or a file. Of a
-    ValueError that a config raises, their parser drops the text.
+    LeRobot's commands print it in one line, whether the value came from a flag or a file. If a config raises
+    a ValueError, their parser drops its text.
     """
 
     def __init__(self, message: str) -> None:
         super().__init__((), message)
 
     def strip_prefix(self, prefix: Sequence[str]) -> NoReturn:
-        """Draccus asks for it to list what is wrong for every type of a union: a flag is told alone."""
+        """Raise this error itself, where draccus would list what is wrong for every type of a union."""
         raise self
 
 
@@ -28,16 +28,16 @@ def hint(words: Sequence[str], flags: Collection[str], argv: Sequence[str]) -> s
     """Return the end of an error message: flags that are spelled much like these words, and how to list all.
 
     Args:
-        words: what is wrong: --env.tsak=place
-        flags: that there are.
-        argv: all that the command was given; where it names types, --help lists their flags.
+        words: the wrong ones, such as --env.tsak=place.
+        flags: all that exist.
+        argv: the command's words. Types among them go before --help, which then lists their flags.
     """
     types = [word for word in argv if re.match(r"--\w+\.type=", word)]
     return f"{nearest(words, flags)}; {' '.join([*types, '--help'])} lists all flags"
 
 
 def nearest(words: Sequence[str], flags: Collection[str]) -> str:
-    """'; nearest: --seed', of the flags that are spelled much like these words; empty: none is."""
+    """Return '; nearest: --seed' with the flags that are spelled much like these words; '' if none is."""
     near = [flag for word in words if word.startswith("--") for flag in nearest_flags(word, flags)]
     return f"; nearest: {', '.join(near)}" * bool(near)
 
@@ -57,7 +57,7 @@ def _name(flag: str) -> str:
 
 
 def refuse_unknown(flag: str, flags: Collection[str], argv: Sequence[str]) -> NoReturn:
-    """Raise a FlagError: the type that was chosen has other flags."""
+    """Raise a FlagError that says that the chosen type has no such flag."""
     raise FlagError(f"{flag} is no flag of this type{hint([flag], flags, argv)}")
 
 

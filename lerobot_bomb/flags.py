@@ -19,7 +19,7 @@ def one_of(flag: str, value: object, allowed: Collection) -> None:
 
 @contextmanager
 def rewording_errors(texts: Mapping[str, str]) -> Iterator[None]:
-    """Replace texts in the message of a ValueError: a shared check names a flag that was not given."""
+    """Replace texts in a ValueError's message, because a shared check may name a flag that was not given."""
     try:
         yield
     except ValueError as error:

@@ -13,7 +13,7 @@ class Registry[T](Mapping[str, T]):
     Args:
         group: of the entry points: "lerobot_bomb.suites".
         own: the objects, or where they are: "module:name".
-        prefix: of the entry points' names, where one group is of several registries.
+        prefix: of the entry points' names, if several registries share a group.
     """
 
     def __init__(self, group: str, own: Mapping[str, T | str], prefix: str = "") -> None:

@@ -35,8 +35,9 @@ def smoothness(
 
     Args:
         actions_RD: in the data's units, in order of time.
-        episode_R: the episode of each; actions of one follow each other.
-        start_R: what episodes share that start alike and are drawn together; each is alone by default.
+        episode_R: the episode of each action; one episode's actions follow each other.
+        start_R: the start of each action's episode; episodes with the same one are drawn together. By default
+            each is alone.
         exclude: dims that do not count, such as a gripper.
         std_D: the data's standard deviation, for normalised units.
         dt_s: seconds between actions, for units per s^2 and per s^3; otherwise per step.
@@ -66,7 +67,7 @@ def smoothness(
 def _mean_difference(
     actions_RD: np.ndarray, episode_R: np.ndarray, start_R: np.ndarray, order: int, step: float
 ) -> Estimate:
-    """Mean of the differences that lie within an episode."""
+    """Estimate the mean norm of the differences that lie within an episode."""
     within = episode_R[order:] == episode_R[:-order]
     if not within.any():
         raise ValueError(f"no episode has {order + 1} actions, as a difference of order {order} takes")

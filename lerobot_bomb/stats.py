@@ -15,12 +15,12 @@ import numpy as np
 Z_95 = NormalDist().inv_cdf(0.975)
 SIGNIFICANT = 0.05  # two-sided
 SMALLEST_P = 1e-99  # that is shown
-POWER = 0.8  # of the numbers of episodes that are asked for
-MAX_PAIRS = 2**20  # that are asked for
+POWER = 0.8  # of the number of pairs that is advised
+MAX_PAIRS = 2**20  # that are advised
 
 
 def wilson_interval(successes: int, n: int) -> tuple[float, float]:
-    """(low, high) of a binomial proportion at 95 %, each in [0, 1].
+    """Return the 95 % interval (low, high) of a binomial proportion, in [0, 1].
 
     Source: Wilson (1927), "Probable inference, the law of succession, and statistical inference".
 
@@ -39,11 +39,11 @@ def _wilson(rate: float, n: float, z: float) -> tuple[float, float]:
 
 
 def clustered_interval(successes_C: np.ndarray, counts_C: np.ndarray) -> tuple[float, float] | None:
-    """95 % interval of a proportion whose records come in clusters; None for a single cluster of several.
+    """Return the 95 % interval of a proportion over clustered records; None for one cluster of several.
 
-    Wilson's interval of as many independent records as tell as much, with Student's t for the number of
-    clusters; never fewer than there are clusters, never more than there are records. Clusters of one record
-    each: Wilson's interval.
+    It is Wilson's interval of the effective number of independent records, which lies between the numbers of
+    clusters and records, with Student's t for the number of clusters. For clusters of one record each, it is
+    Wilson's interval itself.
     Source: Dean and Pagano (2015), "Evaluating confidence interval methods for binomial proportions in
     clustered surveys".
     """
@@ -74,7 +74,7 @@ class Rate:
 
     @classmethod
     def of(cls, is_counted_N: Sequence[bool], cluster_N: Sequence[Hashable]) -> "Rate":
-        """The rate of at least one record; `cluster_N` says which are not independent."""
+        """Compute the rate of one or more records; those of one cluster are not independent."""
         places: dict[Hashable, int] = {}
         place_N = [places.setdefault(cluster, len(places)) for cluster in cluster_N]
         successes_C = np.bincount(place_N, weights=is_counted_N, minlength=len(places))
@@ -94,7 +94,7 @@ class Rate:
         return f"95 % Wilson interval{clusters}"
 
     def __str__(self) -> str:
-        """'48/50 = 96.0 % [86.5, 98.9]'."""
+        """Format as '48/50 = 96.0 % [86.5, 98.9]'."""
         bounds = ""
         if self.interval is not None:
             low, high = self.interval
@@ -103,14 +103,14 @@ class Rate:
 
 
 def format_rate(successes: int, n: int) -> str:
-    """'48/50 = 96.0 % [86.5, 98.9]': count, rate and 95 % Wilson interval of independent records."""
+    """Format count, rate and 95 % Wilson interval of independent records: '48/50 = 96.0 % [86.5, 98.9]'."""
     return str(Rate(successes, n, n, wilson_interval(successes, n)))
 
 
 def mcnemar_p_value(only_first: int, only_second: int) -> float:
     """Two-sided exact p-value of the hypothesis that both groups of paired episodes succeed equally often.
 
-    Given the pairs in which one group alone succeeded, either is as likely as a coin's side (McNemar, 1947).
+    In a pair with a single success, either group has it with probability 1/2 (McNemar, 1947).
     """
     from scipy.special import bdtr
 
@@ -118,7 +118,7 @@ def mcnemar_p_value(only_first: int, only_second: int) -> float:
 
 
 def fisher_p_value(first: int, of_first: int, second: int, of_second: int) -> float:
-    """Two-sided exact p-value of the hypothesis that two groups of other episodes succeed equally often."""
+    """Two-sided exact p-value of the hypothesis that two unpaired groups succeed equally often."""
     from scipy.stats import fisher_exact
 
     found: Any = fisher_exact([[first, of_first - first], [second, of_second - second]])
@@ -126,7 +126,7 @@ def fisher_p_value(first: int, of_first: int, second: int, of_second: int) -> fl
 
 
 def format_p(p_value: float) -> str:
-    """'p = 0.031', never 'p = 0'."""
+    """Format as 'p = 0.031', never 'p = 0'."""
     return f"p = {p_value:.2g}" if p_value >= SMALLEST_P else f"p < {SMALLEST_P:g}"
 
 
@@ -161,7 +161,7 @@ class PairedCounts:
 
     @property
     def difference(self) -> float:
-        """The second group's rate minus the first one's."""
+        """Second group's rate minus the first one's."""
         return (self.only_second - self.only_first) / self.n
 
     @property
@@ -171,7 +171,7 @@ class PairedCounts:
 
 
 def paired_difference_interval(counts: PairedCounts) -> tuple[float, float]:
-    """95 % interval of the second rate minus the first, in [-1, 1]; of one episode, too.
+    """Return the 95 % interval of the second rate minus the first, in [-1, 1]; also for one pair.
 
     Source: Newcombe (1998), "Improved confidence intervals for the difference between binomial proportions
     based on paired data", method 10: Wilson's intervals of both rates, joined by their correlation.
@@ -197,9 +197,9 @@ def paired_difference_interval(counts: PairedCounts) -> tuple[float, float]:
 
 
 def episodes_to_tell_apart(counts: PairedCounts, level: float = SIGNIFICANT) -> int | None:
-    """Number of pairs in which the exact McNemar test finds a difference as large as the one that was seen.
+    """Return how many pairs the exact McNemar test needs to find a difference as large as the observed one.
 
-    At this level, with a power of 80 %; None where no difference was seen, or where `MAX_PAIRS` do not do.
+    It has this level and a power of 80 %. None if no difference was observed, or `MAX_PAIRS` are too few.
     """
     if counts.only_first == counts.only_second:
         return None

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 
 def printable(text: str) -> str:
-    """The text with an escape for what a terminal would obey, or hide: colours, ends of lines."""
+    """Escape what a terminal would obey or hide: colours, ends of lines."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def print_lines(*lines: str) -> None:
-    """Print each in one line, whatever is in it."""
+    """Print each text on one line, whatever is in it."""
     print(*map(printable, lines), sep="\n")
 
 

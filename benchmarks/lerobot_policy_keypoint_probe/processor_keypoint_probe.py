@@ -18,7 +18,7 @@ NUM_WORD_IDS = 4096
 
 
 def word_ids(instruction: str) -> list[int]:
-    """Numbers in 1..NUM_WORD_IDS - 1 of what stands between spaces, punctuation included.
+    """Return a number in 1..NUM_WORD_IDS - 1 for each word between spaces, punctuation included.
 
     No vocabulary and no parsing: "(2," and "2)." are words like any other.
     """
@@ -41,5 +41,5 @@ def make_keypoint_probe_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """Rename, batch, words, device, normalise; and unnormalise, to CPU."""
+    """Make the processors: rename, batch, words, device, normalise; and unnormalise, to CPU."""
     return make_task_processors(config, dataset_stats, WordsStep())

@@ -15,7 +15,7 @@ def masked_mean_pool(states_BTR: Tensor, mask_BT: Tensor) -> Tensor:
 
 
 def modulate(features_BKH: Tensor, gamma_B1H: Tensor, beta_B1H: Tensor) -> Tensor:
-    """Features scaled and shifted, (B, K, H)."""
+    """Scale and shift features (B, K, H)."""
     return gamma_B1H * features_BKH + beta_B1H
 
 
@@ -23,7 +23,7 @@ class FiLM(nn.Module):
     """gamma * h + beta, with gamma and beta (B, H) from pooled states (B, R), the same for all action steps.
 
     Feature-wise linear modulation (Perez et al. 2017, arXiv 1709.07871); DualMod has one for each head.
-    Exactly the identity before training.
+    It is exactly the identity before training.
     """
 
     def __init__(self, state_size: int, dualmod_dim: int, head_dim: int):
@@ -37,7 +37,7 @@ class FiLM(nn.Module):
         )
 
     def coefficients(self, pooled_BR: Tensor) -> tuple[Tensor, Tensor]:
-        """Gamma and beta, (B, 1, H) each."""
+        """Return gamma and beta, (B, 1, H) each."""
         gamma_B1H, beta_B1H = self.layers(pooled_BR)[:, None].chunk(2, dim=-1)
         return gamma_B1H, beta_B1H
 

@@ -1,7 +1,7 @@
 """Losses of a velocity head v and a noise head eps: a regression each, and a term for their agreement.
 
-Conditional means satisfy eps* = A^tau - tau v* at every tau, so that term is zero at the
-optimum of the others. It replaces equations 5 to 7 of FDVLA, which equate a Jacobian with a velocity.
+Conditional means satisfy eps* = A^tau - tau v* at every tau, so the agreement term is zero at the optimum of
+the regressions. It replaces equations 5 to 7 of FDVLA, which equate a Jacobian with a velocity.
 Shapes: `B` batch, `K` action steps, `D` action dims.
 """
 
@@ -50,7 +50,7 @@ def check_learning(
     use_flow_head: bool,
     use_denoise_head: bool,
 ) -> None:
-    """Raise a ValueError that names the weight that leaves a head without a gradient, or both without data.
+    """Raise a ValueError that names a zero weight that leaves a head, or both, nothing to learn from.
 
     A head without a term of its own can still learn from the other one, by agreeing with it.
     """
@@ -72,7 +72,7 @@ def check_learning(
 
 
 def masked_mean(values_BKD: Tensor, loss_mask_BK: Tensor, reduction: str = "mean") -> Tensor:
-    """Mean over the elements in the loss mask, () or with ``reduction="none"`` (B,) over each row's own.
+    """Return the mean over the loss mask, (), or with ``reduction="none"`` over each row's own, (B,).
 
     Zero where the mask is empty.
     """
@@ -92,8 +92,8 @@ def energy_noise(
 ) -> Tensor:
     """(1 - tau) J^T eps with J the Jacobian of eps by A^tau, (B, K, D); the noise itself if it is eps*.
 
-    That holds for a point mass of clean actions only: then eps* = (A^tau - tau A0) / (1 - tau). It is the
-    sound reading of FDVLA's equation 6: the gradient of an energy |eps|^2 / 2, here within the loss mask.
+    The latter holds only for a point mass of clean actions: then eps* = (A^tau - tau A0) / (1 - tau). This is
+    the sound reading of FDVLA's equation 6: the gradient of an energy |eps|^2 / 2, here within the loss mask.
     ``noise_BKD`` must have been computed from ``point.actions``, which ``requires_grad``. ``differentiable``:
     whether the result can be trained through, by a second backward pass that fused attention lacks.
     """
@@ -117,10 +117,11 @@ def joint_loss(
     consistency_detach: str = "none",
     reduction: str = "mean",
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Weighted sum of the terms that there are heads for, and the terms as metrics.
+    """Return the weighted sum, () or (B,), of the terms that have heads, and the terms as metrics.
 
-    Metrics are of the batch, () and detached: ``flow_loss``, ``denoise_loss``, ``consistency_loss``, and as
-    ``consistency_residual_rms`` the root mean square of `consistency_residual`, whatever ``consistency`` is.
+    Metrics are means over the batch, () and detached: ``flow_loss``, ``denoise_loss``, ``consistency_loss``,
+    and as ``consistency_residual_rms`` the root mean square of `consistency_residual`, whatever
+    ``consistency`` is.
 
     Args:
         velocity_BKD: what the flow head predicts, None without one.
@@ -165,7 +166,7 @@ def joint_loss(
 
 @contextmanager
 def second_derivatives(enabled: bool) -> Iterator[None]:
-    """Let attention be differentiated twice, which its fused kernels cannot be."""
+    """If enabled, use attention that can be differentiated twice, unlike its fused kernels."""
     if not enabled:
         yield
         return

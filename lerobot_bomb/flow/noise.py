@@ -1,4 +1,4 @@
-"""The noise that actions are sampled from: one sequence for all episodes, or an episode's own."""
+"""Noise that actions are sampled from: one sequence for all episodes, or one for each."""
 
 from collections.abc import Callable
 
@@ -8,13 +8,13 @@ from torch import Tensor
 
 
 class SamplingNoise:
-    """Noise that is drawn again and again between one ``begin`` of episodes and the next.
+    """Noise for the queries of a batch of episodes, which ``begin`` starts.
 
     Args:
-        seed: of the sequence that all episodes share, and with an episode's number of its own.
-        is_per_episode: whether each episode has a sequence of its own. Its number counts the rows of all
-            batches before it, so in an evaluation it depends on neither the size of the batch nor the row.
-        draw: of N(0, I) unless given; takes a shape and a ``generator``.
+        seed: of the sequence that all episodes share; with an episode's number, of its own sequence.
+        is_per_episode: whether each episode has a sequence of its own. The episode's number counts the rows
+            of all batches before it, so in an evaluation it depends on neither batch size nor row.
+        draw: function of a shape and a ``generator``; by default of N(0, I).
     """
 
     def __init__(self, seed: int, is_per_episode: bool, draw: Callable[..., Tensor] = torch.randn) -> None:
@@ -28,7 +28,7 @@ class SamplingNoise:
         self._generators = []
 
     def draw(self, batch_size: int, shape: tuple[int, ...]) -> Tensor:
-        """(B, *shape) float32 on the CPU. Rows may share memory: not to be written to."""
+        """Draw (B, *shape) float32 on the CPU. Rows may share memory, so do not write to them."""
         num_sequences = batch_size if self._is_per_episode else 1
         for row in range(len(self._generators), num_sequences):
             self._generators.append(torch.Generator().manual_seed(self._seed_of(row)))
@@ -43,5 +43,5 @@ class SamplingNoise:
 
 
 def gumbel(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
-    """Noise of the standard Gumbel distribution: a logit's share in which it is largest is its softmax."""
+    """Draw standard Gumbel noise: with it added, a logit is the largest with its softmax probability."""
     return -torch.empty(shape).exponential_(generator=generator).log()

@@ -1,4 +1,4 @@
-"""The straight path from noise to actions, and the targets of two heads on it.
+"""Straight path from noise to actions, and the targets of two heads on it.
 
 A^tau = (1 - tau) z + tau A0: noise z ~ N(0, I) at tau = 0, clean actions A0 at tau = 1 (flow matching, Lipman
 et al. 2022, arXiv 2210.02747). Shapes: `B` batch, `K` action steps, `D` action dims.
@@ -27,9 +27,9 @@ class PathPoint:
     def implied_actions(
         self, velocity_BKD: Tensor | None, noise_BKD: Tensor | None, tau_min: float, clip_range: float
     ) -> Tensor:
-        """(B, K, D) where the rest of the path leads, by a predicted velocity if there is one, else by noise.
+        """Return the clean actions (B, K, D) implied by a predicted velocity, or by noise if there is none.
 
-        By noise, ``tau_min`` is the least tau that is divided by, and ``clip_range`` bounds the actions.
+        For noise, ``tau_min`` is the least tau that is divided by, and ``clip_range`` bounds the actions.
         """
         tau_B11 = self.tau[:, None, None]
         if velocity_BKD is not None:
@@ -48,7 +48,7 @@ def path_point(clean_BKD: Tensor, noise_BKD: Tensor, tau_B: Tensor) -> PathPoint
 
 
 def draw_tau(time_sampling: str, batch_size: int, generator: torch.Generator) -> Tensor:
-    """(B,) float32 in [0, 1) on the generator's device, for training.
+    """Draw tau for training, (B,) float32 in [0, 1) on the generator's device.
 
     ``uniform``, or ``beta``: pi0's 0.999 (1 - u) with u ~ Beta(1.5, 1), most of it near the noise.
 

@@ -12,9 +12,9 @@ from lerobot_bomb.flow.samplers import Heads, Predicted
 
 
 def without_padding(leftover_KD: Tensor) -> Tensor:
-    """The actions before the zeros that lerobot-rollout puts behind them up to its execution horizon.
+    """Return the actions without the zeros that lerobot-rollout appends up to its execution horizon.
 
-    A chunk guided by those would lead to the mean action, and a horizon beyond the chunk is an error.
+    Zeros would guide a chunk to the mean action, and a horizon beyond the chunk is an error.
     """
     is_action_K = leftover_KD.any(dim=-1).reshape(-1, leftover_KD.shape[-2]).any(dim=0)
     num_actions = int(is_action_K.nonzero().max()) + 1 if is_action_K.any() else 0
@@ -28,10 +28,10 @@ def guided(
     inference_delay: int,
     execution_horizon: int | None = None,
 ) -> Heads:
-    """The heads with a velocity that leads to the actions not executed yet, (B, K, D) or (K, D), normalised.
+    """Return heads whose velocity leads to the normalised leftover actions, (B, K, D) or (K, D).
 
-    The noise goes with it, so that the heads disagree as before: `residual` would take part of the guidance
-    back. None left: nothing is changed.
+    The noise is changed alike, so that the heads disagree as before: otherwise `residual` would undo part of
+    the guidance. Without leftover actions, the heads are returned unchanged.
     """
     if leftover_KD.shape[-2] == 0:
         return heads

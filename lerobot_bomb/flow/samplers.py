@@ -2,13 +2,13 @@
 
 What a step adds, per unit of tau, to actions A at tau, where heads predict a velocity v and a noise eps:
 
-- ``residual``: v + alpha ((A - tau v) - eps), FDVLA's equation 2 with a sound correction: what the heads
-  disagree by. For exact heads that is nothing, so for every alpha this is the flow.
+- ``residual``: v + alpha ((A - tau v) - eps), FDVLA's equation 2 with a sound correction: the heads'
+  disagreement. Exact heads do not disagree, so every alpha gives the flow.
 - ``flow``: v.
 - ``ddim``: (A - eps) / tau, which is ``residual`` with alpha = 1 / tau; see `ddim_step`.
 - ``sde``: v - alpha eps, and noise of variance 2 alpha (1 - tau), which keeps the flow's marginals.
-- ``paper``: v + alpha eps, equation 2 to the letter, for comparison: noise that v takes out comes in again,
-  and actions spread too widely however many steps are made.
+- ``paper``: v + alpha eps, equation 2 to the letter, for comparison: it adds noise that v removes, so actions
+  spread too widely with any number of steps.
 
 Few steps of Euler's rule make the spread too small: from exact heads for N(1, 0.5^2) come standard deviations
 of 0, 0.369, 0.431 and 0.493 with 1, 5, 10 and 100 steps.
@@ -37,9 +37,9 @@ DENOISE_TAU_MIN = 0.02
 CLIP_SAMPLE_RANGE = 5.0
 
 BOTH = ("flow", "denoise")
-# the heads that each reads
+# sampler -> the heads that it reads
 SAMPLERS = {"residual": BOTH, "flow": ("flow",), "ddim": ("denoise",), "sde": BOTH, "paper": BOTH}
-# the samplers that each solves
+# solver -> the samplers that it is for
 SOLVERS = {"euler": tuple(SAMPLERS), "heun": ("residual", "flow", "paper")}
 
 
@@ -51,7 +51,7 @@ def check_sampling(
     denoise_tau_min: float,
     clip_sample_range: float,
 ) -> None:
-    """Raise a ValueError that names the flag of sampling that is wrong."""
+    """Raise a ValueError that names the wrong sampling flag."""
     one_of("sampler", sampler, SAMPLERS)
     one_of("solver", solver, SOLVERS)
     if sampler not in SOLVERS[solver]:
@@ -96,7 +96,7 @@ def ddim_step(
 ) -> Tensor:
     """Noisy actions at ``next_tau``, between the predicted noise and the clean actions that it implies.
 
-    These are clipped, because a small tau makes much of the head's errors. DDIM (Song et al. 2020, arXiv
+    The latter are clipped, because a small tau magnifies the head's errors. DDIM (Song et al. 2020, arXiv
     2010.02502) on this path in place of a variance-preserving one.
     """
     clean = (actions - (1 - tau) * noise) / tau
@@ -115,9 +115,9 @@ def sample(
     clip_sample_range: float = CLIP_SAMPLE_RANGE,
     step_noise_BNKD: Tensor | None = None,
 ) -> Tensor:
-    """Noise of N(0, I) -> normalised actions (B, K, D), float32 whatever the heads compute in.
+    """Sample normalised actions (B, K, D) from noise of N(0, I); float32 whatever the heads compute in.
 
-    A function of its arguments: noise is drawn before, by `SamplingNoise`.
+    The result depends only on the arguments: `SamplingNoise` draws all noise beforehand.
 
     Args:
         heads: called once a step.
@@ -162,7 +162,7 @@ def sample(
 
 
 def _evaluate(heads: Heads, sampler: str, actions_BKD: Tensor, tau: float) -> tuple[Tensor, Tensor]:
-    """Velocity and noise in float32; a scalar zero in place of a head that the sampler does not read."""
+    """Return velocity and noise in float32; a scalar zero for a head that the sampler does not read."""
     velocity_BKD, eps_BKD = heads(actions_BKD, actions_BKD.new_full((len(actions_BKD),), tau))
     check_heads(sampler, velocity_BKD is not None, eps_BKD is not None)
     zero = torch.zeros((), device=actions_BKD.device)

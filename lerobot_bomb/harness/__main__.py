@@ -1,7 +1,7 @@
 """Starts a model server: ``python -m lerobot_bomb.harness --config FILE``; ``vla-eval serve`` runs this file.
 
-It listens on this machine only, unless ``--host`` or ``--address`` says otherwise: it asks nobody for a
-password.
+The server asks for no password, so it listens on this machine only, unless ``--host`` or ``--address`` says
+otherwise.
 """
 
 import logging

@@ -23,12 +23,12 @@ ENVIRONMENT = "bomb_environment"  # of a task: `Environment` as JSON, for a serv
 
 
 class BombBenchmark(StepBenchmark):
-    """BOMB, by the flags of ``--env.type=bomb``.
+    """BOMB with the flags of ``--env.type=bomb``.
 
-    A task is a suite under a condition, with the name of its group in `lerobot-eval` ("place.camera-3"), and
-    for each of `task_ids` one of its own ("place.camera-3.12"). An observation has ``images`` {camera:
-    (H, W, 3) uint8}, ``states`` (4,) float32 in metres and ``task_description``; an action has ``actions``
-    (4,). Units are those of `lerobot_bomb.bomb.observation`.
+    A task is a suite under a condition, named like its group in `lerobot-eval` ("place.camera-3"). Each of
+    `task_ids` makes a task of its own ("place.camera-3.12"). An observation has ``images`` {camera: (H, W, 3)
+    uint8}, ``states`` (4,) float32 in metres and ``task_description``; an action has ``actions`` (4,). Units
+    are those of `lerobot_bomb.bomb.observation`.
 
     Args:
         seed: of each task's first episode; the next ones have the next seeds.
@@ -106,7 +106,7 @@ class BombBenchmark(StepBenchmark):
 
 
 def _env_config(flags: dict[str, Any]) -> Any:
-    """LeRobot's config of ``--env.type=bomb``, read by LeRobot's parser."""
+    """Read the config of ``--env.type=bomb`` with LeRobot's parser."""
     if flags.get("depth"):
         raise ValueError("depth: true: an observation of the harness has no depth; use lerobot-eval")
     register_third_party_plugins()

@@ -30,22 +30,22 @@ EMPTY_CAMERA = "empty_camera"  # what LeRobot's policies call a camera that none
 class CheckpointServer(PredictModelServer):
     """Runs one episode at a time, an action per observation.
 
-    What a policy keeps of an episode (queue of actions, ensemble, past observations, noise) is its own, so
-    another session's observations are refused until the episode has ended: a shard needs a server of its own.
-    An observation has ``images`` {camera: (H, W, 3) uint8}, ``states`` or ``state`` (S,) and
+    A policy keeps the state of one episode (queue of actions, ensemble, past observations, noise). So another
+    session's observations are refused until the episode has ended: each shard needs its own server. An
+    observation has ``images`` {camera: (H, W, 3) uint8}, ``states`` or ``state`` (S,) and
     ``task_description``; an answer has ``actions`` (D,) float32, in the units of the checkpoint's data.
 
     Args:
-        checkpoint: its folder, the one that lerobot-train names pretrained_model, or bomb:NAME.
+        checkpoint: the folder that lerobot-train names pretrained_model, or bomb:NAME.
         device: cpu, cuda, ...; null: the checkpoint's own.
-        seed: of what is random in a policy, as --seed of lerobot-eval.
+        seed: of the policy's random numbers, as --seed of lerobot-eval.
         policy: other values of its config, as the flags --policy.NAME of lerobot-eval.
-        cameras: {camera of the policy: its name in the benchmark}; one that is left out has the same.
-        resize: stretch images to the size that the checkpoint reads; others are refused without it.
-        observation_params: parameters of the benchmark, by which it sends what this policy reads.
+        cameras: {camera of the policy: its name in the benchmark}; a camera left out has the same name.
+        resize: stretch images to the size that the checkpoint reads; without it, other sizes are refused.
+        observation_params: parameters for the benchmark, so that it sends what this policy reads.
 
     Raises:
-        ValueError: there is no such checkpoint, or it holds adapters, or this machine has no such device.
+        ValueError: the checkpoint does not exist or holds adapters, or this machine has no such device.
     """
 
     def __init__(
@@ -104,10 +104,11 @@ class CheckpointServer(PredictModelServer):
             self._episode = None
 
     def predict(self, obs: Observation, ctx: SessionContext) -> Action:
-        """The next action of the episode.
+        """Return the next action of the episode.
 
         Raises:
-            ValueError: the observation is not what the policy reads, or it was trained for another BOMB.
+            ValueError: the observation is not what the policy reads, or the policy was trained for another
+                BOMB.
             RuntimeError: another session's episode is under way.
         """
         if ctx is not self._episode:
@@ -123,7 +124,7 @@ class CheckpointServer(PredictModelServer):
         return {"actions": action[0].float().cpu().numpy()}
 
     def _read_images(self, obs: Observation) -> dict[str, torch.Tensor]:
-        """{key of the policy: (1, 3, H, W) in [0, 1]}."""
+        """Return {key of the policy: (1, 3, H, W) in [0, 1]}."""
         sent = obs.get("images", {})
         images = {}
         for key, camera in self._cameras.items():
@@ -137,7 +138,7 @@ class CheckpointServer(PredictModelServer):
         return images
 
     def _sized(self, image: np.ndarray, size: tuple[int, ...], camera: str) -> np.ndarray:
-        """The image, of this height and width."""
+        """Return the image at this height and width; raise a ValueError if it may not be resized."""
         if image.shape[:2] == size:
             return image
         (height, width), (sent_height, sent_width) = size, image.shape[:2]
@@ -149,7 +150,7 @@ class CheckpointServer(PredictModelServer):
         return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
     def _read_state(self, obs: Observation) -> dict[str, torch.Tensor]:
-        """{observation.state: (1, S)}, if the policy reads it."""
+        """Return {observation.state: (1, S)}, if the policy reads it."""
         feature = self._config.robot_state_feature
         if feature is None:
             return {}

@@ -1,4 +1,4 @@
-"""The model card of our policy types: what the checkpoint is, how to use it, how good it is, whom to cite."""
+"""Model card of our policy types: what the checkpoint is, how to use it, how good it is, whom to cite."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -29,10 +29,10 @@ BAD_REQUEST = 400
 
 
 class PolicyCard(ModelCard):
-    """A model card that the Hub in use checks, be it the public one or another."""
+    """A model card that is validated by the Hub in use, public or not."""
 
     def validate(self, repo_type: str | None = None) -> None:
-        """Validate as huggingface_hub does, which asks the public Hub whatever HF_ENDPOINT says.
+        """Validate at HF_ENDPOINT; huggingface_hub's own method always asks the public Hub.
 
         Raises:
             ValueError: the Hub does not take the card's metadata.
@@ -63,18 +63,18 @@ class Checkpoint:
     adapters_of: str | None = None  # Hub id of the checkpoint that these are adapters of; None: it is whole
 
     def card(self) -> PolicyCard:
-        """The card, not validated."""
+        """Return the card, not validated."""
         return PolicyCard(f"---\n{self._metadata().to_yaml()}\n---\n\n{self._text()}")
 
     @property
     def environment(self) -> Environment | None:
-        """Environment that it was trained for, by its config, or by the dataset if the config is older."""
+        """Environment that the checkpoint was trained for, by its config or else by its dataset."""
         of_dataset = None if self.dataset is None else self.dataset.environment
         return getattr(self.config, "environment", None) or of_dataset
 
     @property
     def backbone(self) -> str | None:
-        """Hub id of its backbone; None if it has none, or not one that is known."""
+        """Hub id of the backbone; None if there is none, or its id is unknown."""
         name = getattr(self.config, "vlm_model_name", None)
         return name if name and is_hub_id(name) else None
 
@@ -178,7 +178,7 @@ class Checkpoint:
         return text + f"\n\n`{SUITE}` is that of its training, which the dataset does not say." * is_open
 
     def _eval_flags(self) -> list[str] | None:
-        """Return the flags of the environment that it was trained for, or evaluated in; None if unknown."""
+        """Return the flags of the environment of the training, or else of the results; None if unknown."""
         knows_suite = self.environment is not None and self.environment.task is not None
         if self.environment is not None and (knows_suite or not self.results):
             return self.environment.eval_flags()

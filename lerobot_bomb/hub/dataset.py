@@ -1,4 +1,4 @@
-"""A recorded dataset, with its card, to the Hub."""
+"""Publishing of a recorded dataset, with its card, on the Hub."""
 
 from contextlib import suppress
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ def read_dataset(root: Path, repo_id: str) -> RecordedDataset:
     """Read and check the dataset in a folder.
 
     Raises:
-        ValueError: it is damaged, or lerobot-bomb did not write it.
+        ValueError: the dataset is damaged, or lerobot-bomb did not write it.
     """
     facts = DatasetFacts.read(root)
     if not facts.bomb:
@@ -71,7 +71,7 @@ def publish_dataset(dataset: RecordedDataset, private: bool | None) -> CommitInf
 
 
 def _is_data(path: str) -> bool:
-    """LeRobot reads every such file, so none may be left of a longer recording."""
+    """Return True for a file that LeRobot reads, so that none is left of a longer recording."""
     return path.split("/")[0] in FOLDERS
 
 
@@ -123,7 +123,7 @@ def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
 
 
 def _tag(repo_id: str, version: str) -> None:
-    """Tag the commit with the version: LeRobot loads the one that has its tag."""
+    """Tag the commit with the dataset's version, the tag that LeRobot loads."""
     api = HfApi()
     with suppress(RevisionNotFoundError):
         api.delete_tag(repo_id, tag=version, repo_type="dataset")

@@ -15,7 +15,7 @@ METRIC = "success_rate"  # a share, 0..1
 
 
 def model_index(groups: list[Group]) -> list[EvalResult]:
-    """Success rates by condition, for the metadata of a model card."""
+    """Return success rates by condition, for the metadata of a model card."""
     return [
         EvalResult(
             task_type="robotics",

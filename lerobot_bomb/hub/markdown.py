@@ -22,21 +22,21 @@ def command(name: str, *flags: str) -> str:
 
 
 def fenced(text: str, language: str = "") -> str:
-    """A block of code, which nothing in it ends."""
+    """Return a block of code, with a fence longer than any run of backticks in it."""
     fence = "`" * max(3, _longest_run(text) + 1)
     shown = "\n".join(map(printable, text.split("\n")))
     return f"{fence}{language}\n{shown}\n{fence}"
 
 
 def code(text: str) -> str:
-    """Code within a line, also of a table; nothing in it ends it."""
+    """Return inline code, also for a table, with more backticks than any run of them in it."""
     ticks = "`" * (_longest_run(text) + 1)
     pad = " " * ("`" in text)
     return f"{ticks}{pad}{printable(text).replace('|', chr(92) + '|')}{pad}{ticks}"
 
 
 def plain(text: str) -> str:
-    """Text that means nothing in Markdown or HTML, also in a table."""
+    """Escape text so that it means nothing in Markdown or HTML, also in a table."""
     return re.sub(r"[\\`*|]|(?<=\])\(", r"\\\g<0>", escape(printable(text), quote=False))
 
 

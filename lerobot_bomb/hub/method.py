@@ -14,7 +14,7 @@ class Paper:
     arxiv: str | None = None
 
     def bibtex(self) -> str:
-        """A BibTeX entry."""
+        """Return a BibTeX entry."""
         entry = {"title": f"{{{self.title}}}", "author": self.authors}
         if self.year is not None:
             entry["year"] = str(self.year)

@@ -31,7 +31,7 @@ from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.push import publish
 from lerobot_bomb.training.distributed import process_number
 
-# arguments that say how a file of the Hub is had
+# arguments that say how a file is fetched from the Hub
 DOWNLOAD = {
     "cache_dir",
     "force_download",
@@ -52,7 +52,7 @@ class HubPolicy:
     """Overrides how LeRobot's `PreTrainedPolicy` loads, saves and publishes checkpoints."""
 
     method: ClassVar[Method]
-    # modules whose tensors in a checkpoint are not needed; that a checkpoint may lack, as they have weights
+    # modules whose tensors a checkpoint need not have; and those it may lack because they have their weights
     may_skip: tuple[str, ...] = ()
     may_lack: tuple[str, ...] = ()
     config_class: Any
@@ -60,7 +60,7 @@ class HubPolicy:
     config: Any
 
     def __init__(self, config: Any, dataset_meta: "LeRobotDatasetMetadata | None" = None):
-        """``dataset_meta``: of the dataset that is trained on, whose statistics must be finite."""
+        """Make a policy; ``dataset_meta`` is of the training dataset, whose statistics must be finite."""
         if not isinstance(config, self.config_class):
             raise ValueError(
                 f"this is a {config.type}, not a {self.name}: load it with "
@@ -78,13 +78,13 @@ class HubPolicy:
         dataset_meta: "LeRobotDatasetMetadata | None" = None,
         **kwargs: Any,
     ) -> Any:
-        """Load as LeRobot does, but check files first; errors are a line that names the file.
+        """Load as LeRobot does, but check files first; an error is one line that names the file.
 
-        A policy that goes on to be trained on a dataset (`dataset_meta`) is of that one's environment.
+        A policy that is loaded to be trained on a dataset (`dataset_meta`) takes that dataset's environment.
 
         Raises:
-            ValueError: one is truncated or not finite, or weights or config are of another policy.
-            OSError: one is missing, or the Hub cannot be reached.
+            ValueError: a file is truncated or not finite, or weights or config are of another policy.
+            OSError: a file is missing, or the Hub cannot be reached.
         """
         _require_finite_statistics_of(dataset_meta)
         folder = Path(pretrained_name_or_path)
@@ -141,7 +141,7 @@ class HubPolicy:
     def _validate_peft_config(self, peft_config: Any) -> None:
         """Store where the base is: its commit, or the absolute path of its folder.
 
-        Adapters that will be published have a base that others can get.
+        Adapters that will be published need a base that others can download.
         """
         _next(super())._validate_peft_config(peft_config)
         base = str(self.config.pretrained_path)
@@ -160,8 +160,9 @@ class HubPolicy:
     ) -> None:
         """Publish in one commit, at the end of `lerobot-train --policy.push_to_hub=true`.
 
-        LeRobot pushes the processors after it, and a kill in between would leave new weights with none or
-        with an older push's. The last checkpoint's are the same, so LeRobot then finds nothing to change.
+        LeRobot pushes the processors afterwards, and a kill in between would leave new weights with no
+        processors or old ones. This commit has the last checkpoint's, which are the same, so LeRobot then
+        finds nothing to change.
         """
         base = None if peft_model is None else str(peft_model.active_peft_config.base_model_name_or_path)
         if base is not None:
@@ -203,7 +204,7 @@ def _require_finite_statistics_of(meta: "LeRobotDatasetMetadata | None") -> None
 
 
 def _tell_wrong_quantiles(meta: "LeRobotDatasetMetadata", modes: Collection[NormalizationMode]) -> None:
-    """Warn if a policy is normalised by quantiles that its dataset's frames do not have."""
+    """Warn if a policy is normalised by quantiles that differ from those of its dataset's frames."""
     if not {NormalizationMode.QUANTILES, NormalizationMode.QUANTILE10} & set(modes):
         return
     try:
@@ -215,5 +216,5 @@ def _tell_wrong_quantiles(meta: "LeRobotDatasetMetadata", modes: Collection[Norm
 
 
 def _next(policy: Any) -> Any:
-    """LeRobot's class, of which a type checker does not know here."""
+    """Return `super()` untyped, because a type checker does not see LeRobot's class here."""
     return policy

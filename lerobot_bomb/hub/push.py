@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from lerobot_bomb.hub.card import Checkpoint
 
 CARD = "README.md"
-# what means nothing on another machine; of other paths the last part stays, as a name
+# fields that mean nothing on another machine; other paths keep their last part, as a name
 LEFT_OUT = {"pretrained_path", "root", "output_dir", "checkpoint_path"}
 
 
 def publish(checkpoint: "Checkpoint", files: Mapping[str, Path], private: bool | None) -> "CommitInfo":
-    """A checkpoint's files and its card in one commit, which takes the place of another checkpoint's.
+    """Publish a checkpoint's files and card in one commit, which replaces an earlier checkpoint's.
 
     Raises:
-        RuntimeError: the Hub cannot be reached or does not take them, or has no base of these adapters.
+        RuntimeError: the Hub cannot be reached or does not take them, or lacks the base of these adapters.
     """
     from huggingface_hub import HfApi
 
@@ -111,7 +111,7 @@ def _check_processors(folder: Path, config: "PreTrainedConfig") -> None:
 
 
 def portable_json(path: Path) -> str:
-    """A config's JSON without paths of this machine."""
+    """Return a config's JSON without paths of this machine."""
     return json.dumps(portable(read_json(path)), indent=4)
 
 

@@ -1,4 +1,4 @@
-"""Training of a checkpoint, as a command."""
+"""Command that trained a checkpoint."""
 
 import json
 from dataclasses import MISSING, Field, fields
@@ -11,7 +11,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot_bomb.checkpoints.names import has_local_path, is_hub_id
 from lerobot_bomb.hub.markdown import command
 
-# a policy's fields that are filled in, or that say where it runs and goes
+# a policy's fields that the code fills in, or that say where it runs and is published
 NOT_FLAGS = {
     "input_features",
     "output_features",

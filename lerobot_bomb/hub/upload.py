@@ -14,7 +14,7 @@ OFFLINE = "HF_HUB_OFFLINE is set, so nothing can be pushed"
 
 
 def check_token() -> None:
-    """Raise unless the Hub may be asked, and can know who pushes."""
+    """Raise a ValueError if HF_HUB_OFFLINE is set, or there is no valid token."""
     if constants.HF_HUB_OFFLINE:
         raise ValueError(OFFLINE)
     token = get_token()
@@ -31,9 +31,9 @@ def upload(
     message: str,
     private: bool | None,
 ) -> CommitInfo:
-    """Make the repository unless it exists; in one commit add all files and delete others like them.
+    """Make the repository unless it exists; in one commit, add all files and delete those they replace.
 
-    ``replaces`` tells which paths of an older push would be read as well.
+    ``replaces`` returns True for a path of an older push that would be read as well.
     `HfApi.upload_folder` would make several commits where Xet is installed.
 
     Raises:

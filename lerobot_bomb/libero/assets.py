@@ -1,11 +1,11 @@
 """LIBERO's files, checked without importing LIBERO: its import asks a question, and its use downloads.
 
 hf-libero 0.1.4 reads $LIBERO_CONFIG_PATH/config.yaml (default: ~/.libero), which names the folders of its
-tasks and initial states. Where there is none, `import libero.libero` asks on the standard input, and fails
-where that is closed. Meshes and textures are not in the package, nor are they found by that file, although it
-has a key `assets`: they are read from the package's own folder `assets`, or else from ~/.cache/libero/assets,
-into which the first environment downloads them from the Hub unless four folders exist there. An interrupted
-download is then never finished; `missing_assets` names what it lacks.
+tasks and initial states. Without that file, `import libero.libero` asks on the standard input, and fails if
+that is closed. Meshes and textures are not in the package, and the file's key `assets` does not count. They
+are read from the package's own folder `assets`, or else from ~/.cache/libero/assets. The first environment
+downloads them there from the Hub, unless four folders exist. So an interrupted download is never finished;
+`missing_assets` names what is missing.
 """
 
 import importlib.util
@@ -22,9 +22,9 @@ from lerobot_bomb.files import written_whole
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
 INSTALL = "pip install 'lerobot[libero]'"
 CONFIG_FILE = "config.yaml"
-# of config.yaml, those that an environment reads
+# the keys of config.yaml that an environment reads
 TASK_FOLDERS = ("bddl_files", "init_states")
-# that hf-libero takes for a finished download
+# folders that hf-libero takes for a finished download
 OBJECT_FOLDERS = (
     "articulated_objects",
     "stable_scanned_objects",
@@ -62,7 +62,7 @@ class Libero:
 
     @property
     def config_file(self) -> Path:
-        """Path of hf-libero's config, in the folder of an environment variable; ~ is not expanded."""
+        """Path of hf-libero's config; a ~ in the environment variable is not expanded."""
         folder = os.environ.get("LIBERO_CONFIG_PATH", os.path.expanduser("~/.libero"))
         return Path(folder) / CONFIG_FILE
 
@@ -76,7 +76,7 @@ class Libero:
         """Write the config file that hf-libero writes after its question, unless there is one.
 
         Raises:
-            ValueError: it cannot be written; names the file and the way out.
+            ValueError: the file cannot be written; names it and the way out.
         """
         import yaml
 
@@ -99,10 +99,10 @@ class Libero:
             ) from error
 
     def task_folders(self) -> dict[str, Path]:
-        """{name in the config file: folder} of task files and initial states, all of which exist.
+        """Return {name in the config file: folder} of task files and initial states; all exist.
 
         Raises:
-            ValueError: there is no config file, or it is none, or names a folder that is missing.
+            ValueError: there is no config file, it is malformed, or it names a missing folder.
         """
         values, new = self._config(), "delete the file, or set LIBERO_CONFIG_PATH to another folder"
         folders = {}
@@ -131,9 +131,9 @@ class Libero:
         return values
 
     def missing_assets(self, suites: Iterable[str] = SUITES) -> list[str]:
-        """Folders and files below `assets` that the tasks of these suites need and lack, sorted.
+        """Return the folders and files below `assets` that the tasks of these suites lack, sorted.
 
-        Textures of files are not looked for: hf-libero replaces some by others.
+        Texture files are not checked: hf-libero replaces some by others.
 
         Raises:
             ValueError: the config file is wrong, or its folders lack a suite.
@@ -155,7 +155,7 @@ class Libero:
         return sorted(missing)
 
     def _missing_of(self, task: str) -> set[str]:
-        """Return the files that a task, given as the text of its file, needs and has not."""
+        """Return the files that a task, given as the text of its file, lacks."""
         problem = re.search(r"\(problem\s+(\w+)\)", task)
         scene = SCENES.get(problem[1]) if problem else None
         files = [self._object_file(name) for name in _object_names(task) - SCENE_FIXTURES]
@@ -164,7 +164,7 @@ class Libero:
         return {path.relative_to(self.assets).as_posix() for path in missing}
 
     def _object_file(self, name: str) -> Path:
-        """The model of an object that a task names; in one of four folders, and if in none, in the first."""
+        """Return the path of an object's model in one of four folders; if it is in none, `*/NAME.xml`."""
         articulated, *others = OBJECT_FOLDERS
         places = [self.assets / articulated / f"{name}.xml"]
         places += [self.assets / folder / name / f"{name}.xml" for folder in others]
@@ -174,7 +174,7 @@ class Libero:
 def prepare_libero(suites: Iterable[str] = SUITES) -> Libero:
     """Make sure that LIBERO can be imported and its suites built: without a question, without a download.
 
-    Write the config file if there is none. To be called before `libero` is imported, in every process.
+    Write the config file if there is none. Call it before `libero` is imported, in every process.
 
     Raises:
         ValueError: LIBERO is not installed, or its config file or assets are missing, partly missing or of
@@ -204,13 +204,13 @@ def describe_missing_assets(assets: Path, missing: list[str]) -> str:
 
 
 def _object_names(task: str) -> set[str]:
-    """Kinds of objects and fixtures that a task's file names: `a_1 a_2 - kind`."""
+    """Return the kinds of objects and fixtures that a task's file names: `a_1 a_2 - kind`."""
     sections = re.findall(r"\(:(?:objects|fixtures)\b(.*?)\)", task, re.DOTALL)
     return {name for section in sections for name in re.findall(r"-\s+(\S+)", section)}
 
 
 def _missing_with_meshes(file: Path) -> list[Path]:
-    """A model's file if it is not there or not whole, else the meshes that it names and that are missing."""
+    """Return a model's file if it is missing or damaged, else the missing meshes that it names."""
     if not file.is_file():
         return [file]
     try:

@@ -9,7 +9,7 @@ from lerobot_bomb.flags import one_of
 from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.libero.perturbations import LiberoCondition
 
-# Of the axes and how a policy is measured; its records say it.
+# Version of the axes and of how a policy is measured; records carry it.
 LIBERO_PROTOCOL_VERSION = "libero-1.0"
 TASKS_PER_SUITE = {suite: 90 if suite == "libero_90" else 10 for suite in SUITES}
 MAX_ALLOWED_STEPS = 10_000
@@ -50,8 +50,8 @@ class LiberoSpec(PerturbedSpec):
 def initial_state_of(seed: int, count: int) -> int:
     """Return the index of the recorded initial state that an episode of a task starts in.
 
-    `lerobot-eval --env.type=libero` goes through them in order, whatever its seed; so episodes are the same
-    here where --seed is a multiple of their number, 50, as its default 1000 is.
+    `lerobot-eval --env.type=libero` goes through these states in order, whatever its seed. So episodes are
+    the same here if --seed is a multiple of their number, 50, as its default 1000 is.
     """
     return seed % count
 

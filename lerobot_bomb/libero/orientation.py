@@ -1,4 +1,4 @@
-"""Orientation of images of LIBERO, one of four, beside what its environment shows.
+"""Orientation of LIBERO's images, one of four, relative to what its environment shows.
 
 No dataset or checkpoint states it. LeRobot's environment turns the simulator's images by 180 degrees, and a
 policy that was trained on others fails without an error.
@@ -7,7 +7,7 @@ policy that was trained on others fails without an error.
 import numpy as np
 
 SAME = "as the environment shows them"
-# over rows, columns
+# steps over rows and columns
 ORIENTATIONS = {
     SAME: (1, 1),
     "turned by 180 degrees, as the simulator gives them": (-1, -1),
@@ -17,13 +17,13 @@ ORIENTATIONS = {
 
 
 def orientation(images: np.ndarray, shown: np.ndarray) -> str:
-    """Return the one of `ORIENTATIONS` of images (N, H, W, 3), relative to those shown, (M, H, W, 3).
+    """Return the orientation of images (N, H, W, 3), a key of `ORIENTATIONS`.
 
-    Both are of one camera and one task, of whatever moments: their means are compared. An environment shows
-    the latter.
+    It is relative to the environment's images ``shown`` (M, H, W, 3). Both are of one camera and one task, of
+    any moments, because their means are compared.
 
     Raises:
-        ValueError: they are of different sizes.
+        ValueError: the images differ in size.
     """
     if images.shape[1:] != shown.shape[1:]:
         raise ValueError(

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 VERBS = ("pick up", "put", "place", "push", "stack", "open", "close", "turn on", "turn off")
 ORDER = re.compile(rf"({'|'.join(VERBS)}) (.+)")
 NEXT_ORDER = re.compile(rf" and (?=(?:{'|'.join(VERBS)}) )")
-# where the place begins: the last of these words, of what is stacked the first "on"
+# the place begins at the last of these words; for a stack, at the first "on"
 PLACE = re.compile(r"(.+) ((?:on|in|to|under) .+|inside)")
 STACK_PLACE = re.compile(r"(.+?) (on .+)")
 STATES = {"open": "open", "close": "closed", "turn on": "turned on", "turn off": "turned off"}
@@ -39,7 +39,7 @@ class Order:
         return f"{thing} {'have' if is_plural else 'has'} been {DONE[self.verb]} {self.place}"
 
     def said(self, verbs: Mapping[str, str]) -> str:
-        """Word it with other verbs: {"put": "set", "turn on": "switch|on"}, the latter around the thing."""
+        """Reword it with other verbs: {"put": "set", "turn on": "switch|on"}, the last around the thing."""
         verb, _, particle = verbs.get(self.verb, self.verb).partition("|")
         if self.verb == "pick up":
             return f"{verb} {self.thing} and {verbs.get('place', 'place')} it {self.place}"
@@ -47,10 +47,10 @@ class Order:
 
 
 def orders_of(instruction: str) -> list[Order]:
-    """Return the orders of an instruction, in its order.
+    """Return the orders of an instruction, one after the other.
 
     Raises:
-        ValueError: it has another form than LIBERO's.
+        ValueError: the instruction has another form than LIBERO's.
     """
     orders: list[Order] = []
     for part in NEXT_ORDER.split(instruction):
@@ -74,7 +74,7 @@ def orders_of(instruction: str) -> list[Order]:
 
 
 def reworded(instruction: str, form: int, variant: int) -> str:
-    """The instruction in one of three wordings of a form of 1..5."""
+    """Reword an instruction, by one of the three templates of a form of 1..5."""
     templates = FORMS[form - 1]
     return templates[variant % len(templates)](orders_of(instruction))
 

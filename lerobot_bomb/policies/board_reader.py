@@ -1,7 +1,7 @@
-"""Reading of board and tray off image tokens: an objective of training beside pointing.
+"""Reading of board and tray from image tokens: a training objective beside pointing.
 
-Instructions name places, and stones, by the stones around them. A policy that is trained on actions and
-places alone learns late to see the stones, and until then no places that depend on them.
+Instructions name places, and stones, by the stones around them. A policy trained on actions and places alone
+learns late to see the stones, and only then the places that depend on them.
 
 Shapes: `B` batch, `P` image tokens of all cameras, `H` hidden size, `N` numbers of a token, `S` spots.
 """
@@ -13,7 +13,7 @@ from lerobot_bomb.bomb.pointing import SPOTS_XY_M
 
 NUM_SPOTS = len(SPOTS_XY_M)
 NUM_STATES = 1 + len(COLORS)  # empty, or a stone of a colour
-# of the network's input and its features: what read 88 % of the stones off eight tokens of 128 numbers
+# sizes of the network's input and features: these read 88 % of the stones from eight tokens of 128 numbers
 INPUT_DIM = 1024
 HIDDEN_DIM = 256
 LEAST_TOKEN_DIM = 4
@@ -22,8 +22,8 @@ LEAST_TOKEN_DIM = 4
 class BoardReader(nn.Module):
     """A small network on image tokens, as the language model gets them.
 
-    The more tokens there are, the fewer numbers each gives, so its size hardly depends on the backbone.
-    Tokens are not averaged, which would blur where a stone lies.
+    The more tokens there are, the fewer numbers each gives, so the network's size hardly depends on the
+    backbone. Tokens are not averaged, which would blur where a stone lies.
     """
 
     def __init__(self, num_tokens: int, hidden_size: int):

@@ -1,4 +1,4 @@
-"""The base of our policies' configs."""
+"""Base of our policies' configs."""
 
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -39,15 +39,15 @@ BOUNDED_MODES = (
 
 @dataclass
 class ChunkConfig(ConfigWithEnvironment):
-    """Chunk, normalisation and training; a policy overrides the defaults that its paper has."""
+    """Config of chunk, normalisation and training; a policy overrides defaults by those of its paper."""
 
     # allowed values of flags
     CHOICES: ClassVar[dict[str, tuple]] = {}
     # how state and action may be normalised
     MODES: ClassVar[tuple[NormalizationMode, ...]] = tuple(NormalizationMode)
-    # whether a checkpoint's weights are of actions of one size; text has any
+    # whether a checkpoint's weights fix the number of action dims; text does not
     ACTIONS_ARE_OF_WEIGHTS: ClassVar[bool] = True
-    # the same of the state
+    # the same for the state's dims
     STATE_IS_OF_WEIGHTS: ClassVar[bool] = True
     # registered name of the processor step that reads the task, which every checkpoint has
     TASK_STEP: ClassVar[str]
@@ -216,7 +216,7 @@ class VlaConfig(ChunkConfig):
 
     @property
     def weights_type(self) -> torch.dtype:
-        """Torch's name for it."""
+        """Torch dtype of `weights_dtype`."""
         return getattr(torch, self.weights_dtype)
 
     @property
@@ -228,7 +228,7 @@ class VlaConfig(ChunkConfig):
         return list(names) if len(names) == num_dims else [str(dim) for dim in range(num_dims)]
 
     def validate_features(self) -> None:
-        # labels are in a dataset's observations, where LeRobot's pipelines keep them, and are no inputs
+        # labels are among a dataset's observations, so that LeRobot's pipelines keep them, but are no inputs
         inputs = self.input_features or {}
         self.input_features = {key: each for key, each in inputs.items() if not key.startswith(LABELS)}
         super().validate_features()

@@ -1,7 +1,7 @@
-"""Point, then act: which stone goes where, predicted first and read in training only.
+"""Point, then act: predict which stone goes where, then the actions; labels are read in training only.
 
-A policy that has read a place right may still not go there, for demonstrations rarely force it to. So on some
-of the frames it is given another place, and the expert's action for that one.
+A policy that predicts the right place may still not go there, because demonstrations rarely force it to. So
+on some training frames it is given another place, and the expert's action for it.
 
 Shapes: `B` batch, `P` places, `K` actions of a chunk, `D` action dims.
 """
@@ -21,7 +21,7 @@ from lerobot_bomb.bomb.pointing import COLUMNS, NUM_OTHERS, PREFIX
 from lerobot_bomb.data.columns import dim_names, present_episodes, read_columns
 from lerobot_bomb.vlm.inputs import read_tensor
 
-LABELS = f"{OBS_PREFIX}{PREFIX}"  # what the keys of a dataset's columns begin with
+LABELS = f"{OBS_PREFIX}{PREFIX}"  # prefix of the labels' columns in a dataset
 PLACE, STONE, OTHER_PLACES, OTHER_ACTIONS, SPOTS = (f"{OBS_PREFIX}{name}" for name in COLUMNS)
 GRIPPER = ("x", "y", "z")  # dimensions of the state
 SAME_PLACE_M = 1e-3
@@ -48,7 +48,7 @@ class MetricLabels:
         device: torch.device,
         generator: torch.Generator,
     ) -> Self:
-        """Read a batch; on a share of its frames, one of their other places is given."""
+        """Read a batch's labels; a share of its frames is given one of their other places."""
 
         def read(key: str) -> Tensor:
             return read_tensor(batch, key, policy_type, device).float()
@@ -66,9 +66,9 @@ class MetricLabels:
     def given_actions(
         self, actions_BKD: Tensor, loss_mask_BK: Tensor, other_B1D: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Actions, and which of them are known, for the places that are given.
+        """Return the actions (B, K, D) for the given places, and the mask (B, K) of those that are known.
 
-        ``other_B1D``: `other_actions`, as ``actions_BKD`` are. Of another place only the next one is known.
+        ``other_B1D``: `other_actions`, as ``actions_BKD`` are. For another place only the next one is known.
         """
         is_first_K = torch.arange(actions_BKD.shape[1], device=actions_BKD.device) == 0
         is_other_BK = self.is_other[:, None] & is_first_K
@@ -99,9 +99,9 @@ class Labels(MetricLabels):
 
 
 class DataUnits(nn.Module):
-    """Values of a dataset that LeRobot normalises to -1 and 1: of the gripper's position and of actions.
+    """Gripper positions and actions of a dataset that LeRobot normalises to -1 and 1.
 
-    A checkpoint keeps them, for its labels are in metres and in the environment's units.
+    A checkpoint keeps these bounds, because its labels are in metres and in the environment's units.
     """
 
     state_bounds: Tensor  # (2, 3) metres of the gripper that are -1 and 1 in a normalised state
@@ -116,7 +116,7 @@ class DataUnits(nn.Module):
 
     @torch.no_grad()
     def fit_units(self, meta: LeRobotDatasetMetadata, modes: Mapping[str, Any]) -> None:
-        """Take the values from a dataset that is normalised by these modes."""
+        """Take the bounds from a dataset that is normalised by these modes."""
         dims = gripper_dims(meta)
         self.gripper_dims.copy_(torch.tensor(dims))
         self.state_bounds.copy_(unit_bounds(meta, OBS_STATE, modes["STATE"])[:, dims])
@@ -133,7 +133,7 @@ class DataUnits(nn.Module):
 
 
 def normalised_actions(actions_BD: Tensor, bounds_2D: Tensor) -> Tensor:
-    """(B, D) actions as LeRobot normalises them, where ``bounds_2D`` are -1 and 1."""
+    """Normalise actions (B, D) as LeRobot does; ``bounds_2D`` become -1 and 1."""
     low_D, high_D = bounds_2D
     size_D = high_D - low_D
     # what never changes is -1, as LeRobot has it
@@ -141,7 +141,7 @@ def normalised_actions(actions_BD: Tensor, bounds_2D: Tensor) -> Tensor:
 
 
 def number_of(xy_B2: Tensor, places_P2: Tensor) -> Tensor:
-    """(B,) int64: the number of the place nearest to each."""
+    """Return the number of the place nearest to each point, (B,) int64."""
     return torch.cdist(xy_B2, places_P2).argmin(dim=1)
 
 
@@ -158,10 +158,10 @@ def require_labels(meta: LeRobotDatasetMetadata, *, reads_board: bool) -> None:
 
 
 def places_of(meta: LeRobotDatasetMetadata, known: list[list[float]] | None) -> list[list[float]]:
-    """(P, 2) metres: the places of a dataset's labels, or ``known`` ones if they include all of these.
+    """Return the places (P, 2) in metres of a dataset's labels, or ``known`` if it includes them all.
 
     Raises:
-        ValueError: it points at places that the checkpoint does not know.
+        ValueError: the dataset points at places that the checkpoint does not know.
     """
     columns = read_columns(meta, (PLACE, OTHER_PLACES), present_episodes(meta))
     found = np.unique(np.concatenate([columns[key].reshape(-1, 2) for key in (PLACE, OTHER_PLACES)]), axis=0)

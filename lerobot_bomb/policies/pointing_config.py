@@ -1,4 +1,4 @@
-"""The flags of policies that may point before they act."""
+"""Flags of policies that may point before they act."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -14,7 +14,7 @@ from lerobot_bomb.training.policy_flags import check_not_negative
 class PointingVlaConfig(VlaConfig):
     """Config of a policy that predicts which stone goes where, and then acts on its prediction."""
 
-    # as `ConfigWithEnvironment` has them
+    # see `ConfigWithEnvironment`
     LATER_FIELDS: ClassVar[dict[str, Any]] = {
         "pointing": False,
         "counterfactual_share": 0.5,
@@ -36,7 +36,7 @@ class PointingVlaConfig(VlaConfig):
 
     @property
     def reads_board(self) -> bool:
-        """Check whether a training reads what lies on the board."""
+        """Return True if training also reads what lies on the board."""
         return self.pointing and self.board_loss_weight > 0
 
     def require_labels(self, meta: LeRobotDatasetMetadata) -> None:
@@ -49,7 +49,7 @@ class PointingVlaConfig(VlaConfig):
 
 @dataclass
 class PlacesVlaConfig(PointingVlaConfig):
-    """Config of a policy that points at places of a table."""
+    """Config of a policy that points at the places of a fixed table."""
 
     LATER_FIELDS: ClassVar[dict[str, Any]] = {**PointingVlaConfig.LATER_FIELDS, "pointing_places": None}
 
@@ -57,10 +57,10 @@ class PlacesVlaConfig(PointingVlaConfig):
     pointing_places: list[list[float]] | None = None
 
     def take_places(self, meta: LeRobotDatasetMetadata | None) -> list[list[float]]:
-        """Return the checkpoint's places, or else the dataset's, which are filled in.
+        """Fill in the dataset's places unless the checkpoint has some, and return them.
 
         Raises:
-            ValueError: there is neither, or the dataset cannot be trained on.
+            ValueError: neither has places, or the dataset cannot be trained on.
         """
         if meta is not None:
             self.require_labels(meta)

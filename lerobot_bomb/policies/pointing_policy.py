@@ -1,4 +1,4 @@
-"""The base of policies that may point before they act."""
+"""Base of policies that may point before they act."""
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ from lerobot_bomb.policies.pointing import SPOTS
 from lerobot_bomb.policies.pointing_config import PointingVlaConfig
 from lerobot_bomb.policies.policy import VlaPolicy
 
-# of metrics, as `lerobot_bomb.actions.accuracy.means` takes them
+# metrics as `lerobot_bomb.actions.accuracy.means` takes them
 type Parts = dict[str, tuple[Tensor, Tensor]]
 
 BOARD_READER = "board_reader"  # attribute; adapters' `modules_to_save`
@@ -28,7 +28,7 @@ class PointingVlaPolicy(VlaPolicy):
     board_reader: BoardReader | None  # None: no board is read
 
     def _add_board_reader(self, hidden_size: int, tokens_per_image: int) -> None:
-        """Make it if the config says so. A checkpoint may have it or not, for no answer depends on it."""
+        """Make the board reader if configured. No action depends on it, so a checkpoint may lack it."""
         if not self.config.reads_board:
             self.board_reader, self.may_skip = None, (*self.may_skip, BOARD_READER)
             return
@@ -38,7 +38,7 @@ class PointingVlaPolicy(VlaPolicy):
     def _with_board(
         self, loss: Tensor, batch: dict[str, Tensor], features_BPH: Tensor
     ) -> tuple[Tensor, Parts]:
-        """Add to a loss, () or (B,), that of reading the stones off image features; return its metrics."""
+        """Add the loss of reading stones off image features to a loss, () or (B,); return its metrics."""
         if self.board_reader is None:
             return loss, {}
         colors_BS = self._of_batch(batch, SPOTS).long()
@@ -54,5 +54,5 @@ class PointingVlaPolicy(VlaPolicy):
 
 
 def plus(loss: Tensor, weight: float, other_B: Tensor) -> Tensor:
-    """Add another loss of each row, weighed, to a loss of them all, (), or of each, (B,)."""
+    """Add a weighted loss of each row to a loss over all rows, (), or of each row, (B,)."""
     return loss + weight * (other_B if loss.ndim else other_B.mean())

@@ -1,4 +1,4 @@
-"""The base of our policies."""
+"""Base of our policies."""
 
 from abc import abstractmethod
 from collections import deque
@@ -59,7 +59,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     action_unit: Tensor
     # flags that say what shapes the weights have
     shapes: ClassVar[tuple[str, ...]]
-    # the same, and flags that say what the model's inputs and answers mean
+    # those, and flags that say what the model's inputs and outputs mean
     as_trained: ClassVar[tuple[str, ...]]
 
     def __init__(self, config: Any, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
@@ -67,13 +67,13 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         run_tasks_in_turn(_is_chunk_policy)
         config.validate_features()
         config.trained_with = trained_with(config, self.as_trained)
-        # physical size of 1 in normalised actions, and their names; known while training: (D,)
+        # (D,) physical size of 1 in normalised actions, and names of the dims; known in training only
         self.register_buffer("action_unit", torch.ones(self.action_dim), persistent=False)
         self._action_names: list[str] | None = None
         if dataset_meta is not None:
             check_chunk_length(config.chunk_size, dataset_meta)
             self._take_units(dataset_meta)
-        # of all that is random in training
+        # for all that is random in training
         self.generator = torch.Generator().manual_seed(torch.initial_seed())
         self._base_buffers: dict[str, Tensor] | None = None  # of the checkpoint, before it was fitted to data
 
@@ -86,7 +86,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
         **kwargs,
     ) -> Self:
-        """Load as LeRobot does, but refuse missing or unexpected tensors; fit to the data that is given."""
+        """Load as LeRobot does, but refuse missing or unexpected tensors; fit to `dataset_meta`, if given."""
         if config is not None:
             check_start(pretrained_name_or_path, config, dataset_meta)
             cls._prepare(config, dataset_meta)
@@ -100,7 +100,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
 
     @classmethod
     def _prepare(cls, config: Any, meta: LeRobotDatasetMetadata | None) -> None:
-        """Check and complete the config of a checkpoint that is loaded, to be trained on if there is data."""
+        """Check and complete the config of a checkpoint; `meta` is of the data to train on, if any."""
         if meta is None:
             check_as_trained(config, cls.as_trained)
         else:
@@ -141,7 +141,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self._batch_size = batch_size
 
     def _loss_mask(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, T) bool: which actions the loss counts; of a static scene only its own."""
+        """Return (B, T) bool, the actions that the loss counts; of a static scene only the first."""
         shape = len(batch[ACTION]), self.config.chunk_size
         is_pad_BT = torch.zeros(shape, dtype=torch.bool, device=self._device)
         if f"{ACTION}_is_pad" in batch:
@@ -149,12 +149,12 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         loss_mask_BT = torch.ones_like(is_pad_BT) if self.config.loss_on_padded_actions else ~is_pad_BT
         if isinstance(done_B1 := batch.get(DONE), Tensor):
             is_later_T = torch.arange(shape[1], device=self._device) > 0
-            # what follows a frame that is done, and is there, belongs to the next scene
+            # actions after a done frame that are no padding belong to the next scene
             loss_mask_BT = loss_mask_BT & ~(done_B1.reshape(-1, 1).bool() & is_later_T & ~is_pad_BT)
         return loss_mask_BT
 
     def _l1_parts(self, errors_BTD: Tensor, counted_BTD: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
-        """Absolute errors as `means` takes them, in all and by dimension; none where units are not known."""
+        """Return absolute errors as `means` takes them, over all dims and by dim; {} if units are unknown."""
         if self._action_names is None:
             return {}
         dims = {
@@ -167,7 +167,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         return read_tensor(batch, key, self.config.type, self._device)
 
     def _state(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, S) normalised."""
+        """Return the normalised state, (B, S)."""
         assert self.config.robot_state_feature is not None
         (num_dims,) = self.config.robot_state_feature.shape
         return read_state(batch, self.config.type, self._device, num_dims)
@@ -187,7 +187,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
 
 
 class VlaPolicy(ChunkPolicy):
-    """One with a vision-language model, whose chunks are executed from a queue or as an ensemble."""
+    """Policy with a vision-language model, whose chunks are executed from a queue or as an ensemble."""
 
     config_class = VlaConfig  # pyright: ignore[reportAssignmentType]
     name = "vla"  # pyright: ignore[reportAssignmentType]
@@ -216,8 +216,8 @@ class VlaPolicy(ChunkPolicy):
     ) -> None:
         """Raise unless the longest prompt and answer fit into the model's positions.
 
-        A token is at least a byte of text, so the tokenizer is asked only if there are too many of these.
-        Where it cannot be had, as in a training further without the base model, the first batch will tell.
+        A token is at least one byte of text, so the tokenizer is loaded only if there are too many bytes.
+        Where it is missing, as in further training without the base model, the first batch raises the error.
 
         Args:
             text_config: of the text model.
@@ -226,7 +226,7 @@ class VlaPolicy(ChunkPolicy):
             meta: of the dataset that is to be trained on, which has the instructions.
 
         Raises:
-            ValueError: they do not.
+            ValueError: prompt and answer do not fit.
         """
         check_positions(text_config, num_fixed, "give a smaller --policy.chunk_size")
         if meta is None:
@@ -254,7 +254,7 @@ class VlaPolicy(ChunkPolicy):
 
     @contextmanager
     def autocast(self) -> Iterator[None]:
-        """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
+        """Use the precision of ``config.dtype`` in training, in evaluation and in a user's own loop."""
         device, bfloat16 = self._device.type, self.config.dtype == "bfloat16"
         # gradients of torch's fused attention in bfloat16 take four to ten times as long on a CPU
         plain = sdpa_kernel(SDPBackend.MATH) if bfloat16 and device == "cpu" else nullcontext()
@@ -289,9 +289,9 @@ class VlaPolicy(ChunkPolicy):
             self._ensemble.reset()
 
     def select_action(self, batch: dict[str, Tensor], **options: Any) -> Tensor:
-        """(B, D) next normalised action; ``options`` as `_predict` takes them.
+        """Return the next normalised action, (B, D); ``options`` as `_predict` takes them.
 
-        With a temporal ensemble every call predicts; else when the queue of ``n_action_steps`` is empty.
+        With a temporal ensemble every call predicts; otherwise only a call that finds the queue empty.
 
         Raises:
             ValueError: the batch has another size than the one before, and `reset` was not called in between.
@@ -310,13 +310,13 @@ class VlaPolicy(ChunkPolicy):
 
     @abstractmethod
     def _predict(self, batch: dict[str, Tensor], num_steps: int, **options: Any) -> Tensor:
-        """The first ``num_steps`` normalised actions of the chunk."""
+        """Return the first ``num_steps`` normalised actions of the chunk, (B, num_steps, D)."""
 
 
 class RelativeVlaPolicy(VlaPolicy):
-    """One whose actions may be differences to the state that a chunk starts from.
+    """Policy whose actions may be differences to the state that a chunk starts from.
 
-    What it is trained on and predicts is relative; what comes out, queue and ensemble are absolute.
+    Training targets and predictions are relative; returned actions, queue and ensemble are absolute.
     """
 
     config_class = RelativeVlaConfig  # pyright: ignore[reportAssignmentType]
@@ -333,7 +333,7 @@ class RelativeVlaPolicy(VlaPolicy):
 
     @classmethod
     def from_pretrained(cls, *args: Any, **kwargs: Any) -> Self:
-        """Load as `VlaPolicy` does; relative actions fit the new data."""
+        """Load as `VlaPolicy` does, and fit relative actions to new data."""
         try:
             return super().from_pretrained(*args, **kwargs)
         except ValueError as error:
@@ -350,7 +350,7 @@ class RelativeVlaPolicy(VlaPolicy):
 
     @torch.no_grad()
     def _fit_relative(self, meta: LeRobotDatasetMetadata) -> None:
-        """Take from a dataset how far its actions are from the state, where they are relative to it."""
+        """Fit relative actions, if used, to the differences of a dataset's actions and states."""
         if self.relative is None:
             return
         config = self.config
@@ -391,7 +391,7 @@ class RelativeVlaPolicy(VlaPolicy):
         return self.relative.encode(actions_BTD, self._state(batch))
 
     def to_absolute(self, predicted_BTD: Tensor, batch: dict[str, Tensor]) -> Tensor:
-        """The inverse of `to_relative`."""
+        """Invert `to_relative`."""
         if self.relative is None:
             return predicted_BTD
         return self.relative.decode(predicted_BTD, self._state(batch))
@@ -426,12 +426,12 @@ class TokenVlaPolicy(VlaPolicy):
     ) -> Tensor:
         """(B, T, D) normalised actions.
 
-        The others are what LeRobot's real-time chunking passes; a chunk of tokens is not guided by them.
+        The other arguments come from LeRobot's real-time chunking; they do not guide a chunk of tokens.
         """
         return super().predict_action_chunk(batch)
 
     def _choice_noise(self, batch_size: int, shape: tuple[int, ...]) -> Tensor | None:
-        """(B, *shape) to add to logits, so that the likeliest choice is a sample; None: greedy."""
+        """Return noise (B, *shape) that makes the argmax of logits a sample; None for a greedy choice."""
         if not self.config.temperature:
             return None
         noise = self._sampling_noise.draw(batch_size, shape)
@@ -439,6 +439,6 @@ class TokenVlaPolicy(VlaPolicy):
 
 
 def _take_action_names(config: Any, meta: LeRobotDatasetMetadata | None) -> None:
-    """Take the dataset's names of dims in one row; of grouped names LeRobot keeps only the groups'."""
+    """Take the dataset's names of action dims as one list; LeRobot keeps only the groups of grouped names."""
     if config is not None and meta is not None:
         config.action_feature_names = dim_names(meta.features[ACTION])

@@ -27,7 +27,7 @@ class RelativeVlaConfig(VlaConfig):
         return [*super().methods(), "relative actions" if self.relative_actions else "absolute actions"]
 
     def relative_dims(self) -> dict[int, int]:
-        """{action dimension that is relative: its state dimension}.
+        """Return {relative action dimension: its state dimension}.
 
         Raises:
             ValueError: an excluded name or a state dimension does not exist, or their numbers differ.

@@ -13,7 +13,7 @@ from lerobot_bomb.conditions import NONE, PerturbedSpec, nuisances_of
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES, PushTCondition
 
-# Of the task, its axes and how a policy is measured; its records say it.
+# Version of the task, its axes and how a policy is measured; records carry it.
 PUSHT_PROTOCOL_VERSION = "pusht-1.0"
 PUSHT_EXTRA = "lerobot_policy_bomb[pusht]"  # what pip installs gym-pusht with
 INSTRUCTIONS = ("templates", NONE)
@@ -24,7 +24,7 @@ MAX_ALLOWED_STEPS = 10_000
 IMAGE_SIZE = 96  # pixels, gym-pusht's own
 MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 512
 
-CENTRE_PX = 45.0  # of the T, along its stem, from the point whose position is the block's
+CENTRE_PX = 45.0  # from the point that is the block's position, along the stem, to the T's centre
 SUCCESS_COVERAGE = 0.95  # gym-pusht's own: above it the episode is a success
 ALMOST_COVERAGE = 0.8
 NEAR_PX = 40.0  # between the T's centre and the target's
@@ -66,7 +66,7 @@ class PushTSpec(PerturbedSpec):
 
 
 def check_installed(tasks: Sequence[str] = ()) -> None:
-    """Raise a ValueError unless gym-pusht is there, whatever the tasks."""
+    """Raise a ValueError unless gym-pusht is installed, whatever the tasks."""
     if find_spec("gym_pusht") is None:
         raise ValueError(f"--env.type=bomb_pusht needs gym-pusht: pip install '{PUSHT_EXTRA}'")
 
@@ -93,5 +93,5 @@ def pusht_failure_of(
 
 
 def centre(pose: np.ndarray) -> np.ndarray:
-    """(3,) pose of a T -> (2,) pixels, the middle of its weight."""
+    """(3,) pose of a T -> (2,) centre of mass in pixels."""
     return pose[:2] + CENTRE_PX * np.array([-np.sin(pose[2]), np.cos(pose[2])])

@@ -1,4 +1,4 @@
-"""Cells that several sections have."""
+"""Cells shared by several sections."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ INTERVALS = "95 % Wilson intervals, clustered by seed"  # of `rate`
 def rate[R: Record](
     records: list[R], is_counted: Callable[[R], bool] = lambda record: record.is_success
 ) -> Cell:
-    """'96 % [87, 99]' of records; '-' of none."""
+    """Return the cell '96 % [87, 99]' of records; '-' of none."""
     if not records:
         return Cell("-")
     found = rate_of(records, is_counted)
@@ -26,7 +26,7 @@ def rate[R: Record](
 
 
 def points(compared: PairedComparison) -> list[Cell]:
-    """'-12 [-20, -5]' per cent, the second rate minus the first; and its p-value."""
+    """Return the cells '-12 [-20, -5]', second rate minus first in percentage points, and p-value."""
     counts, (low, high) = compared.counts, compared.interval
     value = {"difference": counts.difference, "low": low, "high": high, **vars(counts)}
     text = f"{100 * counts.difference:+.0f} [{100 * low:+.0f}, {100 * high:+.0f}]"
@@ -34,7 +34,7 @@ def points(compared: PairedComparison) -> list[Cell]:
 
 
 def mean_cell(mean: Mean | None, form: str, shade: float | None = None) -> Cell:
-    """'0.12 [0.10, 0.15]' in a format; '-' of none."""
+    """Return the cell '0.12 [0.10, 0.15]' in a format; '-' without a mean."""
     if mean is None:
         return Cell("-")
     interval = "" if mean.interval is None else f" [{mean.interval[0]:{form}}, {mean.interval[1]:{form}}]"
@@ -42,5 +42,5 @@ def mean_cell(mean: Mean | None, form: str, shade: float | None = None) -> Cell:
 
 
 def count(number: int, total: int) -> Cell:
-    """A number, coloured by its share; nothing of 0."""
+    """Return the cell of a number, coloured by its share; empty for 0."""
     return Cell(str(number) if number else "", number, number / total if total else 0.0)

@@ -23,7 +23,7 @@ NOTE = (
 
 
 def pointing_tables(check: PointingCheck) -> Iterator[Table]:
-    """Return tables of predicted and true stone, place and next action; and of the likeliest places."""
+    """Yield tables of predicted and true stone, place and next action; and of the likeliest places."""
     pointed, meant = check.pointed, check.meant
     stones_mm = 1e3 * pointed.stone_xy, 1e3 * meant.stone_xy
     rows = [
@@ -62,7 +62,7 @@ def pointing_figure(moment: ExplainedMoment) -> str:
 
 
 def mean_pointing(moments: Sequence[ExplainedMoment]) -> Iterator[Table]:
-    """Return how often pointing is right, its error, and how often the next action goes there."""
+    """Yield a table of how often pointing is right, its error, and how often the next action goes there."""
     checks = [each.pointing for each in moments if each.pointing is not None]
     if not checks:
         return

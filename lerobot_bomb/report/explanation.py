@@ -29,7 +29,7 @@ FOLLOWING_NOTE = (
     "they lead to where they lead then, and how far of that towards the other target."
 )
 SHOWN_PX = 224  # side of an image on the page
-# of the masked episodes, told apart by the colour-blind (Okabe and Ito); once all are taken, with dashes
+# of masked episodes, distinct for the colour-blind (Okabe and Ito); used again with dashes
 TRACE_COLORS = ("#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#999999")
 TRACE_DASHES = ("none", "6 3", "2 2", "8 2 2 2")
 TRACE_SIZE = 420  # pixels of the plot's side
@@ -68,7 +68,7 @@ def _not_asked(moment: ExplainedMoment) -> list[str]:
 
 
 def moment_sections(moment: ExplainedMoment) -> list[Section]:
-    """One moment: maps of the patches, effects of objects and words, what is restored where."""
+    """Write the section of one moment: maps of patches, effects of objects and words, what is restored."""
     explanation = moment.explanation
     note = (
         f"By how much the score of the clean answer drops; it is {explanation.clean_score:.4g} "
@@ -247,7 +247,7 @@ def traces_section(episodes: Mapping[str, MaskedEpisode]) -> Section:
 
 
 def traces_svg(episodes: Mapping[str, MaskedEpisode]) -> str:
-    """The gripper from above over the board: a line an episode, the first one thick."""
+    """Draw the gripper's paths over the board from above: a line per episode, the first one thick."""
 
     def point(xy: np.ndarray) -> str:
         x, y = (xy[:2] * [1, -1] / TRACE_RANGE_M + 1) * TRACE_SIZE / 2
@@ -274,7 +274,7 @@ def traces_svg(episodes: Mapping[str, MaskedEpisode]) -> str:
 
 
 def _trace_look(number: int) -> str:
-    """Return the attributes of a trace's line, its own; the first trace is the one without a mask."""
+    """Return the attributes of a trace's line; trace 0 is the one without a mask."""
     if number == 0:
         return 'stroke="currentColor" fill="none" stroke-width="3"'
     dashes, color = divmod(number - 1, len(TRACE_COLORS))
@@ -283,7 +283,7 @@ def _trace_look(number: int) -> str:
 
 
 def _figure(key: str, image: np.ndarray, map_GG: np.ndarray, largest: float) -> str:
-    """The image, the map cell by cell, the map smoothed over the image."""
+    """Return HTML of the image, the map cell by cell, and the map smoothed over the image."""
     shown = {
         "what is seen": image,
         "the effect of each patch": cells(map_GG, largest, *image.shape[:2]),

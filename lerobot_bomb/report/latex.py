@@ -12,7 +12,7 @@ SPECIAL = {
 
 
 def latex_table(groups: Sequence[Group]) -> str:
-    r"""A `tabular` of the package `booktabs`: a line for each condition, a column for each group."""
+    r"""Write a `tabular` of the package `booktabs`: a line for each condition, a column for each group."""
     by_group = [by_condition(group.records) for group in groups]
     conditions = list(dict.fromkeys(condition for by in by_group for condition in by))
     numbers = sorted({len(records) for by in by_group for records in by.values()})

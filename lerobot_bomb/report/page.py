@@ -5,7 +5,7 @@ from html import escape
 
 from lerobot_bomb.report.table import Cell, Section, Table
 
-# one hue, of which only the strength differs: it reads the same for the colour-blind
+# one hue in different strengths, which reads the same for the colour-blind
 SHADE = "background:rgba(0,114,178,{:.2f})"
 MAX_STRENGTH = 0.55  # text stays readable on it, black or white
 MAX_UNBROKEN = 24  # characters of a cell that stay in one line, even where the table is too wide
@@ -29,7 +29,7 @@ video{display:block;width:20rem;max-width:75vw}
 
 
 def render(title: str, sections: Sequence[Section]) -> str:
-    """The whole page."""
+    """Render the whole page as HTML."""
     links = "".join(f'<a href="#{_anchor(section)}">{escape(section.title)}</a>' for section in sections)
     body = "\n".join(_section(section) for section in sections)
     return (

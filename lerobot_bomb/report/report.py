@@ -12,7 +12,7 @@ from lerobot_bomb.results.record import Record
 
 @dataclass(frozen=True)
 class Sample:
-    """A failed episode that is shown."""
+    """A failed episode that the report shows."""
 
     group: str
     record: Record
@@ -23,12 +23,12 @@ class Sample:
 
     @property
     def command(self) -> str:
-        """Command that runs it again."""
+        """Command that runs the episode again."""
         return shlex.join(["lerobot-bomb", "replay", str(self.path), f"--line={self.line}"])
 
     @property
     def explanation(self) -> str:
-        """Command that asks why; '' where no checkpoint acted."""
+        """Command that explains the episode; '' if no checkpoint acted."""
         if self.record.policy is None or not self.record.policy.path:
             return ""
         return shlex.join(["lerobot-bomb", "explain", f"--results={self.path}", f"--line={self.line}"])
@@ -48,7 +48,7 @@ def sample_failures(
 ) -> Iterator[Sample]:
     """Sample episodes of each group and class of failure; the same files give the same ones.
 
-    `files`: by path and line, those that the groups' records are from.
+    `files`: {path: {line: record}}, from which the groups' records come.
     """
     places = {id(record): (path, line) for path, lines in files.items() for line, record in lines.items()}
     for group in groups:

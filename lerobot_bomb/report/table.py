@@ -24,7 +24,7 @@ class Table:
     note: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """Return the table's numbers."""
+        """Return the table as JSON, numbers in place of their text."""
         rows = [[cell.text if cell.value is None else cell.value for cell in row] for row in self.rows]
         return {"title": self.title, "note": self.note, "header": self.header, "rows": rows}
 
@@ -39,5 +39,5 @@ class Section:
     figures: str = ""  # HTML, above the tables
 
     def as_json(self) -> dict[str, Any]:
-        """Return the section's numbers."""
+        """Return the section as JSON, without figures."""
         return {"title": self.title, "tables": [each.as_json() for each in self.tables], "lines": self.lines}

@@ -1,6 +1,6 @@
 """Verdicts over records: ways in which a success rate can be wrong, question by question.
 
-Groups are lists of records of the same episodes, but for those of the splits.
+Groups hold records of the same episodes, except those of the splits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,7 +46,7 @@ def verdict_tables(groups: Mapping[str, list[Record]], verdicts: list[Verdict]) 
 
 
 def judge(groups: Mapping[str, list[Record]], trained_seeds: Sequence[int] | None) -> list[Verdict]:
-    """Judge every question that the groups have an answer to."""
+    """Judge every question that the groups can answer."""
     policy = groups[POLICY]
     found = [_same_again(pairs_of(policy, groups[AGAIN])), _same_alone(pairs_of(policy, groups[ALONE]))]
     for name, question in ((BLANK, "looks at the images"), (OTHER_INSTRUCTION, "reads the instruction")):

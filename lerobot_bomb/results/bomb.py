@@ -78,9 +78,9 @@ def _progress(records: "Sequence[EpisodeResult]") -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeResult(Record):
-    """Outcome of one episode.
+    """Outcome of one episode of `bomb`.
 
-    `target`, `color` are the episode's; what was asked for is in `spec`, where None means drawn.
+    `target` and `color` are the episode's own; `spec` holds the requested ones, where None means drawn.
     """
 
     env_type: ClassVar = "bomb"
@@ -161,7 +161,7 @@ class EpisodeResult(Record):
         self._check_tasks()
 
     def _check_stage(self) -> None:
-        """Check how far the episode got, as the judge knows it."""
+        """Check stage, failure, progress and errors against each other."""
         is_made = self.failure in ALL_MADE
         self.refuse_if(is_made != (self.stage == Stage.PLACED), "stage", "failure")
         is_untouched = self.failure == Failure.NEVER_REACHED
@@ -175,7 +175,7 @@ class EpisodeResult(Record):
             self.refuse_if(is_disturbed != (self.failure is not None), "collateral_mm", "failure")
 
     def _check_place(self) -> None:
-        """Check where the stone lies; nothing is known of it unless there is one move to one intersection."""
+        """Check where the stone lies, which is known only for one move to one intersection."""
         if self.target is None:
             self.refuse_if(self.is_success_bomb_v0, "is_success_bomb_v0", "target")
             return
@@ -227,7 +227,7 @@ class EpisodeResult(Record):
 
     @classmethod
     def describe_tasks(cls, records: Sequence[Self]) -> str:
-        """'tasks 0, 12', or target and colour, each fixed or drawn."""
+        """Describe the tasks: 'tasks 0, 12', or target and colour, each fixed or drawn."""
         first = records[0]
         if first.task_ids is not None:
             return f"tasks {describe_numbers(first.task_ids)}"
@@ -238,7 +238,7 @@ class EpisodeResult(Record):
         return f"target {drawn}; colour {color or 'drawn'}"
 
     def environment(self) -> Environment:
-        """Return its environment without depth and tasks, which no record holds."""
+        """Return the record's environment, without depth and tasks, which no record holds."""
         spec = self.spec
         return Environment(
             spec.robot, spec.control_mode, spec.fps, self.image_size, CAMERAS, self.task_version, spec.suite
@@ -254,7 +254,7 @@ class EpisodeResult(Record):
 
     @classmethod
     def describe_change(cls, pairs: Sequence[tuple[Self, Self]]) -> str:
-        """'placement error +1.2 mm [+0.3, +2.0] where both put the stone down (40 pairs)'."""
+        """Return 'placement error +1.2 mm [+0.3, +2.0] where both put the stone down (40 pairs)'."""
         both = [pair for pair in pairs if all(each.failure in PUT_DOWN for each in pair)]
         if not both or any(each.target is None for pair in both for each in pair):
             return ""
@@ -266,7 +266,7 @@ class EpisodeResult(Record):
 
 
 def _number(record: EpisodeResult) -> int:
-    """Number of the task of an episode of `place`."""
+    """Return the number of the task of an episode of `place`."""
     return task_id(record.target or (), record.color or "")
 
 

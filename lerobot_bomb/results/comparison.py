@@ -22,11 +22,11 @@ class Comparisons:
 
     @property
     def lowest(self) -> float:
-        """The lowest end of all intervals: the second policy is better by that much under every condition."""
+        """Lowest end of all intervals: the second policy is better by at least that under every condition."""
         return min(each.interval[0] for each in self.conditions)
 
     def lines(self) -> list[str]:
-        """The comparisons as text, a line each."""
+        """Return the comparisons as lines of text."""
         lines = [f"{name}: {policy}" for name, policy in zip("AB", self.policies, strict=True)]
         lines += ["A and B are the same policy"] if self.policies[0] == self.policies[1] else []
         for each in self.conditions:
@@ -50,7 +50,7 @@ def _num_pairs(compared: PairedComparison) -> str:
 
 
 def _lines(compared: PairedComparison) -> list[str]:
-    """The pairs of a condition as text, a line each."""
+    """Return the pairs of a condition as lines of text."""
     counts, (low, high), change = compared.counts, compared.interval, compared.describe_change()
     needed = compared.num_needed
     more = f"; {needed} pairs tell such a difference apart" if needed else ""
@@ -73,7 +73,7 @@ def compare(first: Sequence[Record], second: Sequence[Record]) -> Comparisons:
     """Pair the episodes of two policies.
 
     Raises:
-        ValueError: either are of several policies, or there is no pair; it says what they differ in.
+        ValueError: one side has several policies, or there is no pair; names what differs.
     """
     groups = groups_of(first), groups_of(second)
     policies = _only_policy("the first", groups[0]), _only_policy("the second", groups[1])
@@ -89,7 +89,7 @@ def compare(first: Sequence[Record], second: Sequence[Record]) -> Comparisons:
 
 
 def _by_condition(pairs: list[tuple[Group, Pair]]) -> dict[str, list[Pair]]:
-    """Pairs by condition, and by every setting of which they have several, such as the suite."""
+    """Split pairs by condition, and by every setting with several values, such as the suite."""
     settings = [dict(items) for items in dict.fromkeys(tuple(group.settings.items()) for group, _ in pairs)]
     names = dict.fromkeys(name for values in settings for name in values if name != POLICY)
     several = [name for name in names if len({values.get(name) for values in settings}) > 1]
@@ -101,7 +101,7 @@ def _by_condition(pairs: list[tuple[Group, Pair]]) -> dict[str, list[Pair]]:
 
 
 def _shown(name: str, value: str | None) -> str:
-    """'place' of a suite, 'fps 20' of another setting."""
+    """Return 'place' for a suite, 'fps 20' for another setting."""
     return f"{value}" if name == "suite" else f"{name} {value}"
 
 
@@ -117,7 +117,7 @@ def _only_policy(name: str, groups: list[Group]) -> str:
 
 
 def _pairs(first: list[Group], second: list[Group]) -> Iterator[tuple[Group, Pair]]:
-    """Yield the group of the first record, and both; of an episode that was run again, the last record."""
+    """Yield each pair with the group of its first record."""
     candidates: dict[Any, list[tuple[int, Record]]] = {}
     for place, group in enumerate(second):
         for record in group.records:
@@ -132,15 +132,15 @@ def _pairs(first: list[Group], second: list[Group]) -> Iterator[tuple[Group, Pai
 
 
 def _values_of(groups: list[Group]) -> Values:
-    """{setting: its values in these groups}."""
+    """Return {setting: its values in these groups}."""
     names = groups[0].settings
     return {name: {group.settings.get(name, NOT_RECORDED) for group in groups} for name in names}
 
 
 def _apart(first: Values, second: Values) -> list[str]:
-    """Names of the settings in which the two have no value in common.
+    """Return the settings in which the two have no value in common.
 
-    What was not recorded keeps no episodes apart: an expert is shown no image, so OpenGL drew none.
+    A setting that was not recorded keeps no episodes apart: an expert is shown no image, so OpenGL drew none.
     """
     return [
         name

@@ -21,7 +21,7 @@ class Efficiency:
     num_queries: int
     latency_p50_ms: float  # medians over episodes
     latency_p95_ms: float
-    actions_per_s: float  # that are executed in an episode, by second of its queries
+    actions_per_s: float  # executed in an episode, per second of its queries
     passes: float | None  # means over all queries
     tokens: float | None
     num_parameters: int
@@ -40,7 +40,7 @@ def efficiencies(records: Sequence[Record]) -> list[Efficiency]:
 
 
 def smoothness_of(records: Sequence[Record]) -> dict[str, Estimate]:
-    """{"J2": ..., "J3": ...}, with equal weight for each difference of each episode; {} without any."""
+    """Return {"J2": ..., "J3": ...}, each difference with equal weight; {} if no record has them."""
     told = [each for each in records if each.action_j2 is not None and each.action_j3 is not None]
     return {f"J{order}": _mean_difference(told, order) for order in (2, 3)} if told else {}
 
@@ -55,7 +55,7 @@ def _mean_difference(records: Sequence[Any], order: int) -> Estimate:
 
 
 def lines(records: Sequence[Record]) -> list[tuple[str, str, str]]:
-    """(name, value, note) of each figure that the records have."""
+    """Return (name, value, note) of each figure that the records have."""
     found = [
         ("latency", f"{each.latency_p50_ms:.3g} ms, p95 {each.latency_p95_ms:.3g} ms", _note(each))
         for each in efficiencies(records)

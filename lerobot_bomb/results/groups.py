@@ -12,10 +12,10 @@ from lerobot_bomb.results.record import NOT_RECORDED, Record, describe_numbers
 from lerobot_bomb.stats import Rate
 
 POLICY = "policy"  # the one setting that the episodes of two policies may differ in
-# what may differ between episodes that are pooled; perturbations between those that are paired
+# fields of a spec in which a group's episodes may differ: pooled ones in seed, paired ones in perturbations
 DRAWN = ("seed", "perturbations")
 SHOWN_DIGITS = 6  # of a SHA-256, where names are the same otherwise
-# what does not keep episodes apart
+# fields that a group lists, but that keep no episodes apart
 LISTED = {
     "lerobot_bomb": "package_version",
     "LeRobot": "lerobot_version",
@@ -28,7 +28,7 @@ LISTED = {
 class Group:
     """Episodes of one policy under one set of settings, each once."""
 
-    name: str  # that no other group beside it has: 'act outputs/act, place'
+    name: str  # unique among the groups beside it: 'act outputs/act, place'
     settings: dict[str, str]  # what other groups may differ in
     records: list[Record]
     num_replaced: int  # records of episodes that were run again
@@ -39,7 +39,7 @@ class Group:
 
     @property
     def nominal(self) -> list[Record]:
-        """The unperturbed episodes."""
+        """Records of unperturbed episodes."""
         return [each for each in self.records if each.spec.perturbations == NONE]
 
     @property
@@ -71,7 +71,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Policy:
-    """The groups of one policy, with a short name that no other policy beside it has."""
+    """Groups of one policy, with a short name that is unique among the policies beside it."""
 
     short_name: str
     groups: list[Group]
@@ -91,10 +91,10 @@ def read_results(path: Path) -> list[Record]: ...
 @overload
 def read_results[R: Record](path: Path, record_type: type[R]) -> list[R]: ...
 def read_results(path: Path, record_type: type[Record] = Record) -> Sequence[Record]:
-    """Read the records of a results file, of one environment; of an episode that was run again, the last one.
+    """Read the records of a results file; of an episode that was run again, only the last.
 
     Raises:
-        ValueError: the file is missing or empty, a line is damaged, or of another environment.
+        ValueError: the file is missing or empty, a line is damaged, or a record is not a ``record_type``.
     """
     records, damages = read_records(path)
     if damages:
@@ -109,7 +109,7 @@ def read_results(path: Path, record_type: type[Record] = Record) -> Sequence[Rec
 
 
 def groups_of(records: Iterable[Record]) -> list[Group]:
-    """Split records that must not be pooled or paired; of an episode that was run again, the last one."""
+    """Split records into groups to pool and pair; of an episode that was run again, keep the last record."""
     episodes: dict[tuple[tuple[str, str], ...], dict[Any, Record]] = {}
     counts = Counter[tuple[tuple[str, str], ...]]()
     for record in records:
@@ -150,7 +150,7 @@ def policy_key(record: Record) -> str:
 
 
 def differing(groups: list[Group]) -> list[str]:
-    """Names of the settings that are not the same in all groups."""
+    """Return the settings that are not the same in all groups."""
     names = {name: None for group in groups for name in group.settings}
     return [name for name in names if len({group.settings.get(name) for group in groups}) > 1]
 
@@ -166,7 +166,7 @@ def by_condition[R: Record](records: Iterable[R]) -> dict[AxisCondition, list[R]
 def rate_of[R: Record](
     records: list[R], is_counted: Callable[[R], bool] = lambda record: record.is_success
 ) -> Rate:
-    """Rate of successes, or of another property, of at least one record; one start is one cluster."""
+    """Return the rate of successes, or of another property, of one or more records, clustered by start."""
     return Rate.of(list(map(is_counted, records)), [each.start_key for each in records])
 
 
@@ -177,7 +177,7 @@ def _fixed(record: Record) -> dict[str, Any]:
 
 
 def _told_apart(named: list[tuple[str, Record]]) -> list[str]:
-    """Tell the same names apart by the weights of the records' policies, then by numbers."""
+    """Make equal names different: by the weights of the records' policies, then by numbers."""
     doubled = {name for name, number in Counter(name for name, _ in named).items() if number > 1}
     long = [f"{name} {_weights(each)}".strip() if name in doubled else name for name, each in named]
     still = {name for name, number in Counter(long).items() if number > 1}
@@ -190,7 +190,7 @@ def _told_apart(named: list[tuple[str, Record]]) -> list[str]:
 
 
 def policy_name(record: Record) -> str:
-    """'TYPE'; of a checkpoint with its folder: 'act outputs/act'."""
+    """Return 'TYPE', for a checkpoint with its folder: 'act outputs/act'."""
     if record.policy is None:
         return "policy not recorded"
     path = record.policy.path
@@ -198,7 +198,7 @@ def policy_name(record: Record) -> str:
 
 
 def _group_name(record: Record) -> str:
-    """'act outputs/act, place'."""
+    """Return policy and suite: 'act outputs/act, place'."""
     suite = getattr(record.spec, "suite", None)
     return policy_name(record) + (f", {suite}" if suite else "")
 

@@ -17,7 +17,7 @@ class Query:
 
     seconds: float  # until the actions are there
     passes: int | None  # of the network, the prompt's included; None: this policy does not tell
-    tokens: float | None  # that were generated for an episode; None: the same, or it generates none
+    tokens: float | None  # generated for one episode; None: not told, or none generated
     num_parameters: int
     peak_memory_bytes: int | None  # since the policy was first asked; None: this system does not tell
     device: str
@@ -29,7 +29,7 @@ class Inference:
 
     num_queries: Count  # queries of the episode: calls that ran the network
     total_s: Positive  # seconds of all queries
-    # median seconds of a query in ms; a query serves all episodes of the batch
+    # median latency of a query in ms; a query serves all episodes of the batch
     latency_p50_ms: Positive
     latency_p95_ms: Positive  # 95th percentile of the same
     # forward passes per query, mean, prompt and sampling steps included; null: unknown

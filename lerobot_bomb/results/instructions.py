@@ -7,14 +7,14 @@ from lerobot_bomb.results.bomb import EpisodeResult
 
 
 def named_targets(records: Sequence[EpisodeResult]) -> dict[str, Any]:
-    """{instruction: its target}: in `place` the intersection; elsewhere it depends on the board."""
+    """Return {instruction: its target}: an intersection in `place`; elsewhere the instruction itself."""
     return {
         each.instruction: each.target if each.spec.suite == "place" else each.instruction for each in records
     }
 
 
 def other_instructions(records: Sequence[EpisodeResult]) -> dict[str, str]:
-    """{instruction: another with another target}; {} if all have the same target."""
+    """Return {instruction: another one, mostly with another target}; {} if all targets are the same."""
     targets = named_targets(records)
     first, *others = targets.values()
     if all(other == first for other in others):

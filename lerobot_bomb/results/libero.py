@@ -20,7 +20,7 @@ from lerobot_bomb.results.origin import (
 from lerobot_bomb.results.record import Record, describe_numbers
 from lerobot_bomb.results.schema import Count, Natural
 
-# what the bits of an episode depend on
+# packages that the bits of an episode depend on
 SIMULATOR = ("mujoco", "robosuite", "hf-libero", "numpy")
 
 
@@ -34,7 +34,7 @@ class TaskSpec(Protocol):
 
 
 def numbers_by_suite(specs: Sequence[TaskSpec]) -> dict[str, set[int]]:
-    """{suite: numbers of its tasks}."""
+    """Return {suite: numbers of its tasks}."""
     numbers: dict[str, set[int]] = {}
     for spec in specs:
         numbers.setdefault(spec.suite, set()).add(spec.task_id)
@@ -42,20 +42,20 @@ def numbers_by_suite(specs: Sequence[TaskSpec]) -> dict[str, set[int]]:
 
 
 def describe_numbered_tasks(specs: Sequence[TaskSpec]) -> str:
-    """'libero_spatial tasks 0..2'."""
+    """Describe tasks as 'libero_spatial tasks 0..2'."""
     numbers = numbers_by_suite(specs)
     return ", ".join(f"{suite} tasks {describe_numbers(ids)}" for suite, ids in numbers.items())
 
 
 def task_flags(specs: Sequence[TaskSpec]) -> dict[str, str | list[int]]:
-    """Flags of lerobot-eval, without `--env.`, for the tasks of episodes."""
+    """Return lerobot-eval's flags, without `--env.`, for the tasks of episodes."""
     numbers = numbers_by_suite(specs)
     return {"task": ",".join(numbers), "task_ids": sorted(set().union(*numbers.values()))}
 
 
 @dataclass(frozen=True, kw_only=True)
 class LiberoResult(Record):
-    """Outcome of one episode."""
+    """Outcome of one episode of `bomb_libero`."""
 
     env_type: ClassVar = "bomb_libero"
     condition: ClassVar = LiberoCondition

@@ -33,15 +33,15 @@ def installed_version(distribution: str) -> str | None:
 
 
 def installed_versions(distributions: Iterable[str]) -> dict[str, str | None]:
-    """{distribution: version}; None if one has no metadata."""
+    """Return {distribution: version}; None if one has no metadata."""
     return {name: installed_version(name) for name in distributions}
 
 
 @cache
 def machine_name() -> str:
-    """Processor and C library of this machine: "x86_64, AMD EPYC, glibc 2.36".
+    """Return processor and C library of this machine: "x86_64, AMD EPYC, glibc 2.36".
 
-    The library has variants of sine and cosine for each processor; their last bits are in every state.
+    The library's sine and cosine vary with the processor, and their last bits are in every state.
     """
     cpus = Path("/proc/cpuinfo")  # of Linux
     lines = cpus.read_text().splitlines() if cpus.is_file() else []
@@ -68,7 +68,7 @@ class PolicyIdentity:
     interventions: tuple[str, ...] = ()  # names of the preprocessor's steps that change the input on purpose
 
     def describe(self) -> str:
-        """'act outputs/act (weights 0123456789ab, settings 0123456789ab)', 'act'."""
+        """Describe the policy: 'act', or 'act outputs/act (weights 0123456789ab, settings 0123456789ab)'."""
         revision = f"@{self.revision}" if self.revision else ""
         sums = {"weights": self.weights_sha256, "settings": self.settings_sha256}
         notes = [f"{name} {sha256[:SHOWN_DIGITS]}" for name, sha256 in sums.items() if sha256]
@@ -87,12 +87,12 @@ class PolicyIdentity:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Evaluation of LeRobot's that an episode is of."""
+    """LeRobot's evaluation that an episode belongs to."""
 
     num_episodes: Count  # episodes of the whole evaluation: of all its tasks and conditions
     seed: Natural | None  # --seed: the first episode's; null: not given
 
 
 def describe_versions(versions: Mapping[str, str | None]) -> str:
-    """'gym-pusht 0.1.8, pymunk 6.11.1': the packages that an episode's bits depend on."""
+    """Describe the packages that an episode's bits depend on: 'gym-pusht 0.1.8, pymunk 6.11.1'."""
     return ", ".join(f"{name} {version or '?'}" for name, version in versions.items())

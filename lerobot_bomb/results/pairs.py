@@ -1,4 +1,4 @@
-"""Records of the same episodes in pairs, by condition: how often which is a success, and is it chance?"""
+"""Pairs of records of the same episode, by condition: how often does each succeed, and is it chance?"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ type Pair = tuple[Record, Record]  # one episode unperturbed and perturbed, or o
 
 @dataclass(frozen=True)
 class PairedComparison:
-    """The pairs of one condition, tested as one of several conditions."""
+    """Pairs of one condition, tested as one of several conditions."""
 
     condition: str
     pairs: list[Pair]
@@ -34,7 +34,7 @@ class PairedComparison:
 
     @property
     def num_needed(self) -> int | None:
-        """Number of pairs for the test to find such a difference; None if it did, or never does."""
+        """Number of pairs for the test to find this difference; None if it did, or never will."""
         if self.p_value < SIGNIFICANT:
             return None
         return episodes_to_tell_apart(self.counts, SIGNIFICANT / self.num_conditions)
@@ -50,7 +50,7 @@ class PairedComparison:
 
 
 def pair_with_nominal(records: Sequence[Record]) -> dict[str, list[Pair]]:
-    """{condition: pairs of the unperturbed and the perturbed record} of a group, for episodes with both."""
+    """Return {condition: pairs of unperturbed and perturbed record} of a group's episodes with both."""
     nominal = {_episode(each): each for each in records if each.spec.perturbations == NONE}
     pairs: dict[str, list[Pair]] = {}
     for record in records:
@@ -77,7 +77,7 @@ def count_pairs(pairs: Sequence[Pair]) -> PairedCounts:
 
 
 def compare_pairs(pairs: Mapping[str, list[Pair]]) -> list[PairedComparison]:
-    """Pairs by condition, tested together: the p-values are those of one family (Holm)."""
+    """Compare the pairs of each condition; the p-values are adjusted as one family (Holm)."""
     counts = {condition: count_pairs(condition_pairs) for condition, condition_pairs in pairs.items()}
     adjusted = holm([each.p_value for each in counts.values()])
     return [
@@ -87,7 +87,7 @@ def compare_pairs(pairs: Mapping[str, list[Pair]]) -> list[PairedComparison]:
 
 
 def describe_test(num_conditions: int) -> str:
-    """'exact McNemar test, adjusted for 11 conditions (Holm)': the test of a p-value."""
+    """Describe the test of a p-value: 'exact McNemar test, adjusted for 11 conditions (Holm)'."""
     if num_conditions == 1:
         return "exact McNemar test of one condition, not adjusted"
     return f"exact McNemar test, adjusted for {num_conditions} conditions (Holm)"

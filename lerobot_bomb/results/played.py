@@ -1,4 +1,4 @@
-"""Evaluations that records are of: how many of their episodes there are."""
+"""Evaluations that records belong to: how many of their episodes were run."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,9 +11,9 @@ PER_TASK = ("suite", "task_version")
 
 
 def describe_missing_episodes(records: Sequence[Record]) -> str:
-    """'7 of 20 episodes played', of each evaluation that lacks some; '': none does, as far as records say it.
+    """Return '7 of 20 episodes played' for evaluations that lack some; '' if, as far as recorded, none does.
 
-    An evaluation counts no more once later ones have run each of its episodes again.
+    An evaluation no longer counts once later ones have run each of its episodes again.
     """
     kept = {_key(each) for group in groups_of(records) for each in group.records}
     played: dict[Any, set[Spec]] = {}
@@ -29,5 +29,5 @@ def describe_missing_episodes(records: Sequence[Record]) -> str:
 
 
 def _key(record: Record) -> tuple[Any, ...]:
-    """Return a key that is equal for the records of one evaluation, which is its first part."""
+    """Return a key that is equal for the records of one evaluation; its first part is the evaluation."""
     return record.evaluation, *(pair for pair in settings_of(record).items() if pair[0] not in PER_TASK)

@@ -32,15 +32,15 @@ from lerobot_bomb.results.origin import (
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.results.schema import Count, Natural
 
-# what the bits of an episode depend on
+# packages that the bits of an episode depend on
 SIMULATOR = ("gym-pusht", "pymunk", "pygame", "opencv-python-headless")
-# rounding may take a covered area past the target's
+# rounding may make the covered area larger than the target's
 Coverage = Annotated[float, schema.between(0, 1 + 1e-9)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class PushTResult(Record):
-    """Outcome of one episode."""
+    """Outcome of one episode of `bomb_pusht`."""
 
     env_type: ClassVar = "bomb_pusht"
     condition: ClassVar = PushTCondition
@@ -97,7 +97,7 @@ class PushTResult(Record):
 
     @classmethod
     def describe_change(cls, pairs: Sequence[tuple[Self, Self]]) -> str:
-        """'max coverage -0.120 [-0.200, -0.040]': the mean change of (unperturbed, perturbed) pairs."""
+        """Describe the mean change of (before, after) pairs as 'max coverage -0.120 [-0.200, -0.040]'."""
         changes = np.array([after.max_coverage - before.max_coverage for before, after in pairs])
         interval = bca_interval(changes, np.ones(len(pairs)))
         return f"max coverage {changes.mean():+.3f}{format_bounds(interval, '+.3f')}"

@@ -1,4 +1,4 @@
-"""Records of results files, of whichever environment: read and checked."""
+"""Reading and checking of results files of any environment."""
 
 import json
 import re
@@ -25,7 +25,7 @@ def record_type_of(version: str) -> type[Record] | None:
 
 @cache
 def _schema(record_type: type[Record], version: str) -> Schema[Record]:
-    """Schema of the records of a protocol version; fields that only other versions lack are required."""
+    """Return the schema of a protocol version; fields that only other versions lack are required."""
     of_others = {name for names in record_type.versions.values() for name in names}
     must_have = of_others - set(record_type.versions[version])
     lacking = {name: value for name, value in record_type.earlier.items() if name not in must_have}
@@ -36,7 +36,7 @@ def read_records(path: Path) -> tuple[dict[int, Record], list[str]]:
     """Return {line number, from 1: record} of a results file, and the damage of its other lines.
 
     Raises:
-        ValueError: there is no such file.
+        ValueError: there is no such file, or it is a folder.
     """
     if path.is_dir():
         files = ", ".join(str(each) for each in sorted(path.glob("*.jsonl")) if each.name != "errors.jsonl")
@@ -76,7 +76,7 @@ def parse_record(line: bytes) -> Record:
         ValueError: the line is not JSON, or a field is missing, mistyped or impossible.
     """
     try:
-        text = line.decode()  # of bytes, json reads halves of surrogate pairs, too
+        text = line.decode()  # from bytes, json would read halves of surrogate pairs, too
         values = json.loads(text)
     except json.JSONDecodeError as error:
         raise ValueError(f"{error.msg.removesuffix(' at')} at column {error.colno}") from None

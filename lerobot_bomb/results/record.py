@@ -22,13 +22,13 @@ NOT_RECORDED = "not recorded"
 NO_VALUE = "-"  # of a measure that these episodes do not have
 MAX_RUNS = 10  # of numbers, in a heading
 
-# of a record: who acted, with which tasks beside, and what simulated; the rest is the episode
+# fields of a record that say who acted, in which evaluation, and what simulated; the rest is the episode
 ORIGIN = {
     "policy", "task_ids", "evaluation", "opengl_vendor", "opengl_renderer", "machine", "mujoco_version",
     "simulator_versions", "lerobot_version", "torch_version", "package_version", "task_version",
     "protocol_version",
 }  # fmt: skip
-# of a record: what an episode that is run again, bit for bit, has otherwise
+# fields of a record that differ when an episode is run again, bit for bit
 MEASURED = {"inference"}
 
 
@@ -62,8 +62,8 @@ class Record(ABC):
 
     env_type: ClassVar[str]
     condition: ClassVar[type[AxisCondition]]  # its perturbations
-    # {protocol version: fields that its records lack}, the oldest first; it is how records are known, so no
-    # two environments share one
+    # {protocol version: fields that its records lack}, the oldest first; a version tells the environment,
+    # so no two environments share one
     versions: ClassVar[Mapping[str, tuple[str, ...]]]
     # {field that records of earlier releases lack: its value in them}
     earlier: ClassVar[Mapping[str, Any]] = {
@@ -75,14 +75,14 @@ class Record(ABC):
         "policy.batch_row": None,
         "policy.interventions": (),
     }
-    # of a spec, what may differ between episodes that are pooled, beside seed and perturbations
+    # fields of a spec that may differ between pooled episodes, beside seed and perturbations
     drawn: ClassVar[tuple[str, ...]] = ()
-    # of a spec, what episodes have in common that start alike: they are not independent
+    # fields of a spec that are equal in episodes that start alike, which are not independent
     start: ClassVar[tuple[str, ...]] = ("seed",)
     tasks: ClassVar[Sequence[str]]  # values of --env.task
     measures: ClassVar[Sequence[Measure]] = ()
     has_results_path: ClassVar[bool] = True  # lerobot-eval writes the records, with --env.results_path
-    # an episode's number in its evaluation chooses how it starts, not its seed: in batches of one
+    # an episode's number in its evaluation, not its seed, chooses how it starts: in batches of one
     starts_by_number: ClassVar[bool] = False
 
     spec: Spec
@@ -104,7 +104,7 @@ class Record(ABC):
     evaluation: Evaluation | None = None  # evaluation that it is of; null: not recorded, or of none
 
     def as_json(self) -> dict[str, Any]:
-        """Return the fields as a record has them, in its order."""
+        """Return the fields in the order of a record."""
         values = dataclasses.asdict(self)
         return {name: values[name] for name in field_names(type(self))}
 
@@ -135,7 +135,7 @@ class Record(ABC):
         """Raise a ValueError that names fields of this environment which contradict each other."""
 
     def refuse_if(self, is_impossible: bool, first: str, *others: str) -> None:
-        """Raise a ValueError that shows fields which, each possible, are not so together."""
+        """Raise a ValueError that shows fields that are possible alone, but not together."""
         if is_impossible:
             values = {name: json.dumps(attrgetter(name)(self)) for name in (first, *others)}
             shown = [f"{name}={value[:SHOWN_CHARACTERS]}" for name, value in values.items()]
@@ -197,7 +197,7 @@ class Record(ABC):
 
 @cache
 def field_names(record_type: type[Record]) -> tuple[str, ...]:
-    """Names of the fields in the order in which they are written."""
+    """Return the names of the fields in the order in which they are written."""
     known = {each.name for each in dataclasses.fields(record_type)}
     named = (name for base in record_type.__mro__ for name in vars(base).get("__annotations__", ()))
     return tuple(dict.fromkeys(name for name in named if name in known))
@@ -209,9 +209,9 @@ def without_measured[R: Record](record: R) -> R:
 
 
 def outcome_fields(record: Record) -> list[str]:
-    """Names of the fields of spec and outcome: not of policy, machine and latency.
+    """Return the names of the fields of spec and outcome, not of policy, machine and latency.
 
-    Without what the record, of an earlier release, does not say.
+    Fields that a record of an earlier release lacks are left out.
     """
     missing = object()
     return [
@@ -227,7 +227,7 @@ def different_fields(record: Record, other: Record) -> list[str]:
 
 
 def describe_numbers(numbers: Iterable[int]) -> str:
-    """{0, 1, 2, 7} -> '0..2, 7'; of many runs, the first and the last number."""
+    """{0, 1, 2, 7} -> '0..2, 7'; for many runs, the first and the last number."""
     runs: list[list[int]] = []
     for number in sorted(set(numbers)):
         if runs and number == runs[-1][-1] + 1:

@@ -35,7 +35,7 @@ def is_sha256(value: str) -> bool:
     return re.fullmatch("[0-9a-f]{64}", value) is not None
 
 
-# types of fields; a check stands behind the type of the values that it is for
+# types of fields; a check follows the type of its values
 Natural = Annotated[int, between(0)]
 Count = Annotated[int, between(1)]
 Quantity = Annotated[float, between(0)]
@@ -85,7 +85,7 @@ def check_of(hint: Any) -> Check:
 
 
 def _types_without_check(hint: Any) -> frozenset[type]:
-    """Return the types all of whose JSON values pass the check, so that it need not be called."""
+    """Return the types whose JSON values always pass the check, so that it need not be called."""
     some = _without_none(hint)
     bare = frozenset({some} & {bool, int, str})
     return bare if some is hint else bare | {NoneType}
@@ -107,7 +107,7 @@ class Schema[T]:
     Args:
         cls: the dataclass.
         lacking: {field that an object may lack: its value then}; of a nested one, "spec.task_id".
-        closed: names of nested ones that are refused with fields of which the dataclass knows nothing.
+        closed: names of nested ones that are refused if they have a field that their dataclass lacks.
         name: of the field that the dataclass is nested in; '' for the outermost.
     """
 
@@ -134,10 +134,10 @@ class Schema[T]:
         self._needs = frozenset(self._required)
 
     def read(self, values: Mapping[str, Any]) -> T:
-        """Make the dataclass of an object.
+        """Read a JSON object as the dataclass.
 
         Raises:
-            ValueError: names the fields that are missing, or the first that is impossible.
+            ValueError: names missing fields, the first impossible one, or unknown ones of a closed object.
         """
         if not self._needs <= values.keys():
             missing = [f"{self._prefix}{each}" for each in self._required if each not in values]

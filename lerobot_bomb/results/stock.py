@@ -37,7 +37,7 @@ class StockSpec(PerturbedSpec):
 
 @dataclass(frozen=True, kw_only=True)
 class StockResult(Record):
-    """Outcome of one episode; a subclass for each env type, which `stock_result` makes."""
+    """Outcome of one episode of LeRobot's own env types; `stock_result` makes a subclass for each."""
 
     simulator: ClassVar[Sequence[str]]  # packages that the bits of an episode depend on
     drawn_size: ClassVar[str | None] = None  # width and height of its images, whatever its flags say

@@ -21,7 +21,7 @@ class Summary:
     efficiency: list[tuple[str, str, str]]  # name, value and note of what was measured
 
     def lines(self) -> list[str]:
-        """The summary as text, a line each."""
+        """Return the summary as lines of text."""
         figures = [("success", str(self.rate), self.rate.method)]
         figures += [
             (measure.name, value, measure.note)
@@ -33,7 +33,7 @@ class Summary:
 
 
 def named_counts(counts: Counter[str]) -> str:
-    """'dropped 3, imprecise 1', the most frequent first."""
+    """Format counts as 'dropped 3, imprecise 1', the most frequent first."""
     return ", ".join(f"{name} {count}" for name, count in counts.most_common()) or "none"
 
 

@@ -1,4 +1,4 @@
-"""Keeps clients that open a request and send nothing from holding a server's workers."""
+"""Limits on requests, so that clients that send nothing cannot hold a server's workers."""
 
 import threading
 from collections import deque

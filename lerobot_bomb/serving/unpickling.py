@@ -1,8 +1,8 @@
 """Unpickling of the messages of LeRobot's client, without running the code that a pickle names.
 
-A pickle may name any function and have it called, with any arguments; here it may name the two messages, and
-arrays, scalars and tensors of plain numbers, which are made here of bytes that are there. Whatever it does to
-what it gets stays in what is returned.
+A pickle may name any function and have it called with any arguments. Here it may name the two messages, and
+arrays, scalars and tensors of plain numbers, which are built here from bytes of the message. What a pickle
+changes in them stays in what is returned.
 """
 
 import io
@@ -21,7 +21,7 @@ from torch._utils import _rebuild_tensor_v2  # what a pickled tensor names
 MAX_OPCODES = 20_000  # a message of a robot with a hundred joints has some thousands
 MAX_FIELDS = 64  # of a message
 MAX_DIMS = 32  # of an array
-# what the pickles of these messages are made of; others are for other objects, or of the time before Python 3
+# operations in the pickles of these messages; others are for other objects, or from before Python 3
 OPCODES = {
     "PROTO", "FRAME", "STOP", "MARK", "NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1",
     "BINFLOAT", "SHORT_BINUNICODE", "BINUNICODE", "SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "BYTEARRAY8",
@@ -40,10 +40,10 @@ MESSAGES = {
 
 
 def loads(data: bytes | None) -> Any:
-    """A RemotePolicyConfig or a TimedObservation.
+    """Read a RemotePolicyConfig or a TimedObservation.
 
     Raises:
-        pickle.UnpicklingError: it is something else, or the client sent no end.
+        pickle.UnpicklingError: the data is something else, or the client did not finish it.
     """
     if data is None:
         raise pickle.UnpicklingError("the client ended its message before its end")
@@ -60,7 +60,7 @@ def loads(data: bytes | None) -> Any:
 
 
 def _check_opcodes(data: bytes) -> None:
-    """Raise an error unless these are operations of a message, and all bytes are there that they read."""
+    """Raise an error unless these are operations of a message, and all bytes that they read are there."""
     for number, (opcode, _, _) in enumerate(pickletools.genops(data)):
         if opcode.name not in OPCODES:
             raise pickle.UnpicklingError(f"no message of LeRobot's client has {opcode.name}")
@@ -132,14 +132,14 @@ class _Unpickler(PythonUnpickler):
         super().load_build()
 
     def _fill(self, empty: _Array, version: int, shape: Any, dtype: Any, is_fortran: Any, data: Any) -> None:
-        """Put the array where the empty one stands: on the stack, and in the memo for what refers to it."""
+        """Put the array in place of the empty one: on the stack, and in the memo for later references."""
         array = self._array(data, dtype, shape, "F" if is_fortran else "C")
         self.stack[-2] = array
         for number in [number for number, value in self.memo.items() if value is empty]:
             self.memo[number] = array
 
     def _array(self, data: Any, dtype: Any, shape: Any, order: Any) -> np.ndarray:
-        """Build an array as NumPy does, of numbers that are all there."""
+        """Build an array as NumPy does; all its numbers must be there."""
         size = _size(shape)
         if (
             not isinstance(data, bytes | bytearray)
@@ -158,7 +158,7 @@ class _Unpickler(PythonUnpickler):
         return self._array(data, dtype, (), "C")[()]
 
     def _storage(self, data: Any) -> Any:
-        """Build a storage as torch does; but torch unpickles whatever it is given."""
+        """Build a storage as torch does, but not by unpickling whatever is given."""
         if not isinstance(data, bytes):
             raise pickle.UnpicklingError("a tensor of LeRobot's client has bytes")
         self._use(len(data))

@@ -1,6 +1,6 @@
 """A worker's process: `python -m lerobot_bomb.sweep FOLDER PART RUN FILE_DESCRIPTOR`.
 
-It ends with its standard input, which its parent holds, however the parent ended.
+It ends when its standard input does. Its parent holds that, so it ends however the parent ended.
 """
 
 import os
@@ -15,7 +15,7 @@ def _end_with_parent() -> None:
 
 
 if __name__ == "__main__":
-    # before LeRobot is imported: workers of a command that was killed would first do that, half a minute long
+    # before LeRobot is imported: workers of a killed command would first spend half a minute on that
     threading.Thread(target=_end_with_parent, daemon=True).start()
     from lerobot_bomb.sweep.worker import run_worker
 

@@ -11,7 +11,7 @@ from lerobot_bomb.sweep.manifest import Job, Manifest
 def check(manifest: Manifest, begun: Sequence[Job] = ()) -> None:
     """Check that LeRobot reads every job's flags, and that no policy was trained for another environment.
 
-    Whoever has begun a job has checked those that differ from it in their conditions only.
+    Jobs that differ from one in ``begun`` only in their conditions have been checked before.
 
     Raises:
         SystemExit: flags are wrong; LeRobot's parser has said which.

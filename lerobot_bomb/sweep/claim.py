@@ -16,18 +16,18 @@ LOCK = "sweep.lock"  # held by every command that runs the manifest; alone by on
 
 @contextmanager
 def claimed(folder: Path, wanted: Manifest, batch_size: int | None = None) -> Iterator[Store]:
-    """Hold a folder for a manifest, or for the one that is there, extended by the wanted one.
+    """Hold a folder for a manifest: the wanted one, or the folder's own, extended by the wanted one.
 
     Other commands may run the same manifest at the same time; stderr says so.
 
     Args:
-        folder: made where it is missing.
-        wanted: what is to be run.
-        batch_size: of a job, at most; where it is given, jobs that are there count as the first episodes of
-            longer ones.
+        folder: created if it is missing.
+        wanted: the jobs to run.
+        batch_size: largest of a job. If it is given, the folder's jobs count as the first episodes of longer
+            ones.
 
     Raises:
-        ValueError: episodes of other jobs are there, or another command runs other jobs there.
+        ValueError: the folder has episodes of other jobs, or another command runs other jobs there.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / LOCK).open("a") as lock:
@@ -57,10 +57,10 @@ def _is_alone(lock: IO[str]) -> bool:
 
 
 def _grown(folder: Path, there: Manifest | None, wanted: Manifest, batch_size: int | None) -> Manifest:
-    """Return the folder's manifest from now on: the wanted one, with the jobs that are there unchanged.
+    """Return the folder's manifest from now on: the wanted one, with the folder's jobs unchanged.
 
     Raises:
-        ValueError: jobs are there that it does not have, and episodes of that manifest have been run.
+        ValueError: the folder has jobs that are not wanted, and some of its episodes have been run.
     """
     if there is None or there == wanted or Store(folder, there).is_untouched():
         return wanted
@@ -78,10 +78,10 @@ def _grown(folder: Path, there: Manifest | None, wanted: Manifest, batch_size: i
 
 
 def _with_rest(job: Job, there: Manifest, batch_size: int) -> list[Job]:
-    """Split a job into those that are there from its seed on, and one with the missing seeds.
+    """Split a job into the folder's jobs from its seed on, and one with the missing seeds.
 
     Raises:
-        ValueError: such a job would start its episodes otherwise.
+        ValueError: the latter would start its episodes differently.
     """
     of_same = {each.seed: each for each in there.jobs if (each.policy, each.env) == (job.policy, job.env)}
     parts: list[Job] = []

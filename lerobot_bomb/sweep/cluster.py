@@ -34,7 +34,7 @@ def submit(
 
     Args:
         commands: run in the folder that this process is in.
-        logs: a folder, of submitit's files.
+        logs: folder for submitit's files.
         cluster: the name of an executor; None: submitit chooses.
         parameters: of submitit's AutoExecutor.
 

@@ -15,16 +15,16 @@ from lerobot_bomb.sweep.manifest import Job
 from lerobot_bomb.sweep.processes import num_cores, visible_gpus, worker_environments
 from lerobot_bomb.sweep.store import POLL_S, REFUSED, Store
 
-# -P: nothing in the folder that the user is in stands for a module of the same name
+# -P: no file in the user's folder replaces a module of the same name
 PYTHON = (sys.executable, "-P", "-m")
 MAX_ENDED = 3
 MAX_SHOWN_WARNINGS = 5
 
 
 def progress(store: Store, jobs: Sequence[Job]) -> Iterator[bool]:
-    """Show how far the jobs are until all are over, and yield whether they are further than before.
+    """Show progress until all jobs are over; yield True if there was any since the last yield.
 
-    The records of jobs that have been finished are merged, whatever ends this process later.
+    Records of finished jobs are merged at once, whatever ends this process later.
     """
     total = sum(job.num_episodes for job in jobs)
     left, num_before = _not_over(store, jobs)  # what is over is not read again
@@ -44,7 +44,7 @@ def progress(store: Store, jobs: Sequence[Job]) -> Iterator[bool]:
 
 
 def _not_over(store: Store, jobs: Sequence[Job]) -> tuple[list[Job], int]:
-    """Return the jobs that are to be run, and how many episodes of the others have been."""
+    """Return the jobs that are not over, and how many episodes of the others have been run."""
     is_over = {job: store.is_over(job) for job in jobs}
     over = [job for job in jobs if is_over[job]]
     return [job for job in jobs if not is_over[job]], store.num_run(over)
@@ -82,16 +82,16 @@ class WorkerProcess:
 
     @property
     def is_refused(self) -> bool:
-        """True if the process ended because flags are wrong."""
+        """Return True if the process ended because flags are wrong."""
         return self._process.returncode == REFUSED
 
     def kill(self, reason: str = "") -> None:
-        """End it, whatever it does: code that is not Python's heeds nothing else."""
+        """Kill the process, because native code heeds nothing else."""
         self._end = reason
         self._process.kill()
 
     def close(self) -> None:
-        """Wait for its end."""
+        """Wait until the process has ended."""
         self._process.wait()
         if self._process.stdin is not None:
             self._process.stdin.close()
@@ -108,13 +108,13 @@ def ended(code: int) -> str:
 
 
 class Workers:
-    """The worker processes of one command; each is restarted when it has ended.
+    """Worker processes of one command; each is restarted when it has ended.
 
     Args:
-        store: what is run.
+        store: the sweep.
         command: starts a worker.
-        environments: of each.
-        timeout_s: of a job; None: none.
+        environments: environment variables of each worker.
+        timeout_s: limit of a job; None: no limit.
     """
 
     def __init__(
@@ -134,10 +134,10 @@ class Workers:
         self._num_idle_ends = 0  # of workers that had begun no job, since an episode was run
 
     def look(self, has_progressed: bool) -> None:
-        """Start those that are missing, end those whose job takes too long.
+        """Start missing workers, and kill those whose job takes too long.
 
         Raises:
-            RuntimeError: they end before they run, or refuse to; the message says why.
+            RuntimeError: workers end before they run a job, or refuse to; the message says why.
         """
         self._num_idle_ends = 0 if has_progressed else self._num_idle_ends
         for number, worker in enumerate(self._workers):
@@ -167,20 +167,20 @@ class Workers:
             raise RuntimeError(f"workers end before they run: {reason}; see {self._path}")
 
     def _last_line(self) -> str:
-        """The last line that this command's workers have said, '' where they said nothing."""
+        """Return the last line that this command's workers have logged, '' if none."""
         return next((line.strip() for line in reversed(self._said()) if line.strip()), "")
 
     def _said(self) -> list[str]:
-        """Return the lines that this command's workers have said."""
+        """Return the lines that this command's workers have logged."""
         return self._path.read_bytes()[self._start :].decode(errors="replace").split("\n")
 
     def warnings(self) -> list[str]:
-        """Return what this package has warned of in workers, each warning once."""
+        """Return this package's warnings in workers, each once."""
         found = (re.match(r"WARNING:lerobot_bomb[\w.]*:(.+)", line) for line in self._said())
         return list(dict.fromkeys(match[1] for match in found if match))
 
     def close(self) -> None:
-        """End all."""
+        """Kill all workers and wait for them."""
         for worker in self._workers:
             worker.kill()
         for worker in self._workers:
@@ -192,7 +192,7 @@ def run_part(store: Store, part: str, num_workers: int, timeout_s: int | None = 
     """Run a part of the jobs: start workers, and restart those that ended.
 
     Raises:
-        RuntimeError: they end before they run, or refuse to; the message says why.
+        RuntimeError: workers end before they run a job, or refuse to; the message says why.
     """
     jobs = store.manifest.part(part)
     num_workers = min(num_workers, len(jobs))

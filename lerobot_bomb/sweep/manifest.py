@@ -44,7 +44,7 @@ class Job:
 
     @property
     def key(self) -> str:
-        """The flags in a form for file names; equal for equal jobs only."""
+        """Flags in a form for file names; equal for equal jobs only."""
         words = "-".join(flag.partition("=")[2] for flag in (*self.policy[:1], *self.env))
         readable = re.sub(r"[^a-z0-9_.]+", "-", words.lower()).strip("-")
         digest = hashlib.sha256(json.dumps(self.flags).encode()).hexdigest()
@@ -61,13 +61,13 @@ class Job:
         return flag_value(self.env, "--env.type") or ""
 
     def episode(self, number: int) -> "Job":
-        """One of its episodes, alone."""
+        """Return the job of one of its episodes."""
         return Job(self.policy, self.env, self.seed + number, 1, 1)
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """Jobs of a sweep, in the order of its records; none is there twice."""
+    """Jobs of a sweep, in the order of its records, each once."""
 
     jobs: tuple[Job, ...]
 
@@ -83,7 +83,7 @@ class Manifest:
         """Return every n-th job: for '0/4' the first, the fifth, ...
 
         Raises:
-            ValueError: the text is no such part, or there are too few jobs for it to have one.
+            ValueError: the text is malformed, or there are too few jobs for this part.
         """
         first, number = parse_part(text)
         if first >= len(self.jobs):
@@ -101,8 +101,8 @@ class Manifest:
         """Read the manifest in a folder.
 
         Raises:
-            FileNotFoundError: there is none.
-            ValueError: it is damaged, or of another version of this package.
+            FileNotFoundError: there is no manifest.
+            ValueError: the manifest is damaged, or of another version of this package.
         """
         path = folder / NAME
         values = read_json(path)
@@ -134,10 +134,10 @@ def _at_least(lowest: int, values: dict[str, Any], name: str) -> int:
 
 
 def parse_part(text: str) -> tuple[int, int]:
-    """(0, 4) from '0/4'.
+    """Parse '0/4' as (0, 4).
 
     Raises:
-        ValueError: it is spelled otherwise, or there is no such part.
+        ValueError: the text is malformed, or names no such part.
     """
     first, _, number = text.partition("/")
     if not (first.isdecimal() and number.isdecimal() and int(first) < int(number)):
@@ -146,7 +146,7 @@ def parse_part(text: str) -> tuple[int, int]:
 
 
 def flag_value(flags: Sequence[str], name: str) -> str | None:
-    """'bomb' of '--env.type=bomb'; None if it is not among them."""
+    """Return a flag's value: 'bomb' of '--env.type=bomb'; None if it is not given."""
     return next((flag.partition("=")[2] for flag in flags if flag.startswith(f"{name}=")), None)
 
 
@@ -172,14 +172,14 @@ def plan(
     Args:
         policies: checkpoints, or policy types.
         tasks: values of `--env.task`; none: LeRobot's default.
-        conditions: each of a job of its own; none: an environment without perturbations.
+        conditions: one job each; none: an environment without perturbations.
         seed: the first one of each job.
         num_episodes: of each job.
         batch_size: of each job, at most.
         flags: of lerobot-eval, for all.
 
     Raises:
-        ValueError: a flag is one that the plan decides.
+        ValueError: a flag is one that the plan sets.
     """
     check_flags(flags)
     of_policy = [flag for flag in flags if flag.startswith("--policy.")]
@@ -202,10 +202,10 @@ def _condition_flags(condition: str) -> list[str]:
 
 
 def policy_flag(policy: str) -> str:
-    """'--policy.path=bomb:NAME', '--policy.type=act': a path has a slash or a colon, or holds a checkpoint.
+    """Return '--policy.path=...' for bomb:NAME, text with a slash or a checkpoint, else '--policy.type=...'.
 
     Raises:
-        ValueError: it can be neither a checkpoint, here or on the Hub, nor a type.
+        ValueError: ``policy`` can be neither a checkpoint, here or on the Hub, nor a type.
     """
     path = checkpoint_path(policy)
     is_here = Path(policy).is_file() or (Path(policy) / CONFIG).is_file()
@@ -225,5 +225,5 @@ def policy_flag(policy: str) -> str:
 
 
 def largest_divisor(number: int, most: int) -> int:
-    """Return the largest divisor: LeRobot fills the last batch, and then runs no more episodes than asked."""
+    """Return the largest divisor up to `most`: LeRobot fills the last batch, so no extra episode is run."""
     return max(size for size in range(1, min(number, most) + 1) if number % size == 0)

@@ -25,7 +25,7 @@ def visible_gpus(environment: Mapping[str, str], driver: Path = DRIVER) -> list[
 def worker_environments(
     num_workers: int, environment: Mapping[str, str], cores: int, gpus: Sequence[str]
 ) -> list[dict[str, str]]:
-    """One a worker: an even share of the cores as threads, unless they are set, and a GPU in turn."""
+    """Return one per worker: an even share of the cores as threads, unless set, and a GPU in turn."""
     threads = {"OMP_NUM_THREADS": str(max(1, cores // num_workers))}
     return [
         threads | dict(environment) | ({GPUS: gpus[worker % len(gpus)]} if gpus else {})

@@ -1,8 +1,8 @@
 """Store of a sweep's progress: a folder that any number of workers share.
 
-A job is finished where `cells/KEY.jsonl` holds all its episodes; a worker that runs one holds the lock on
-`cells/KEY.lock`, which the system takes from it if it is killed. The job of such a worker is run again, at
-most three times in one run. A stopped sweep, whose workers may outlive it by moments, is no failed attempt.
+A job is finished when `cells/KEY.jsonl` holds all its episodes. A worker that runs it holds the lock on
+`cells/KEY.lock`, which the system releases if the worker is killed. The job is then run again, with three
+attempts at most in one run. Stopping a sweep, whose workers may outlive it by moments, is no failed attempt.
 """
 
 import json
@@ -43,7 +43,7 @@ class EpisodeError:
         """Read a line of a file.
 
         Raises:
-            ValueError, TypeError: it is no error of an episode.
+            ValueError, TypeError: the line is no error of an episode.
         """
         return cls(
             **{"job" if name == "cell" else name: value for name, value in dict(json.loads(line)).items()}
@@ -51,7 +51,7 @@ class EpisodeError:
 
 
 def missing_seeds(job: Job, lines: Sequence[str | bytes], errors: Sequence[EpisodeError]) -> list[int]:
-    """Seeds of a job that have neither an error nor as many records as the others, one for each task.
+    """Return a job's seeds that have neither an error nor as many records as the others, one for each task.
 
     Raises:
         ValueError: a line is no record.
@@ -66,7 +66,7 @@ def missing_seeds(job: Job, lines: Sequence[str | bytes], errors: Sequence[Episo
 
 
 class Store:
-    """The folder of a sweep.
+    """Progress of a sweep, in its folder.
 
     Args:
         folder: where `manifest` lies.
@@ -84,7 +84,7 @@ class Store:
         return self.folder / JOBS / f"{job.key}.{ending}"
 
     def is_finished(self, job: Job) -> bool:
-        """Return True if the file of its records is there and whole; a crash can cut it off."""
+        """Return True if the job's file of records is there and whole; a crash can cut it off."""
         path = self.file(job, "jsonl")
         try:
             state = path.stat()
@@ -116,7 +116,7 @@ class Store:
             return is_mine
 
     def begin(self, job: Job) -> bool:
-        """Count an attempt; give the job up, and return False, if there were enough that were killed."""
+        """Count an attempt and return True; after `MAX_ATTEMPTS`, give the job up and return False."""
         if self._num_attempts(job) >= MAX_ATTEMPTS:
             self.give_up(job, f"{MAX_ATTEMPTS} workers ended while they ran it")
             return False
@@ -124,18 +124,18 @@ class Store:
         return True
 
     def fail(self, job: Job, reason: str) -> None:
-        """Give the job up, if the attempt that ended so was the last."""
+        """Give the job up if this was its last attempt."""
         if self._num_attempts(job) >= MAX_ATTEMPTS:
             self.give_up(job, f"{reason}; {MAX_ATTEMPTS} attempts")
 
     def lost(self, job: Job, reason: str) -> None:
-        """Note why the worker ended that ran the job, unless another has finished it or runs it now."""
+        """Note why the worker that ran the job ended, unless another has finished it or runs it now."""
         with self.claimed(job) as is_mine:
             if is_mine and not self.is_finished(job):
                 self.fail(job, reason)
 
     def in_turn(self, jobs: Sequence[Job]) -> list[Job]:
-        """Return the jobs to run; those whose job or policy has killed workers come last."""
+        """Return the jobs, sorted so that those of a policy that has killed workers come last."""
         attempts = {job: self._num_attempts(job) for job in jobs}
         of_policy: Counter[tuple[str, ...]] = Counter()
         for job, number in attempts.items():
@@ -176,7 +176,7 @@ class Store:
             yield True
 
     def finish(self, job: Job, lines: list[str], errors: list[EpisodeError]) -> None:
-        """Keep a job's records, by seed, and the errors of seeds without one."""
+        """Write a job's records, by seed, and the errors of seeds without one."""
         self.file(job, "errors").unlink(missing_ok=True)  # of an attempt that could not be written
         if errors:
             with written_whole(self.file(job, "errors")) as (path,):
@@ -194,7 +194,7 @@ class Store:
     def merge(self) -> None:
         """Write all finished jobs' records in the order of the manifest, and all errors."""
         with (self.folder / JOBS / "merge.lock").open("w") as lock:
-            flock(lock, LOCK_EX)  # who writes last has read what all that wrote before had finished
+            flock(lock, LOCK_EX)  # the last to write has read all jobs that earlier ones had finished
             for name, ending in ((RESULTS, "jsonl"), (ERRORS, "errors")):
                 paths = [self.file(job, ending) for job in self.manifest.jobs if self.is_finished(job)]
                 with written_whole(self.folder / name) as (path,):

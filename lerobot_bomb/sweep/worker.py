@@ -34,11 +34,11 @@ FATAL = (RefusedError, OSError)  # for a job, whichever episode it was
 
 
 class Worker:
-    """One process.
+    """Worker process of a sweep.
 
     Args:
         store: the sweep.
-        tell: is told the key of a job that begins, and '' when it ends.
+        tell: called with the key of a job that begins, and with '' when it ends.
     """
 
     def __init__(self, store: Store, tell: Callable[[str], None] = lambda key: None) -> None:
@@ -85,7 +85,7 @@ class Worker:
         return lines, errors
 
     def _evaluate(self, job: Job, whole: Job) -> list[str]:
-        """Run a job and return its records, in the order of their seeds; it is a part of `whole`."""
+        """Run a job, a part of `whole`, and return its records in the order of their seeds."""
         part = self._store.file(job, "part")
         part.unlink(missing_ok=True)
         check_assets(job)
@@ -141,7 +141,7 @@ def check_assets(job: Job) -> None:
 
 
 class LastLine(io.TextIOBase):
-    """Passes text on to a stream, and keeps its last line: a command that exits has said there why."""
+    """Passes text on to a stream, and keeps its last line, in which a command that exits says why."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -157,13 +157,13 @@ class LastLine(io.TextIOBase):
 
 
 def describe(error: BaseException) -> str:
-    """'ValueError: its last line'."""
+    """Describe an error as 'ValueError: its last line'."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[-1]}" if lines else type(error).__name__
 
 
 def run_worker(folder: str, part: str, run: str, told: str) -> None:
-    """Run a part of the sweep in a folder; the job that runs goes to the file descriptor `told`."""
+    """Run a part of the sweep in a folder; report the running job to the file descriptor `told`."""
     faulthandler.enable()  # a fault of native code says where it was
     logging.basicConfig(level=logging.WARNING)
     manifest = Manifest.read(Path(folder))

@@ -18,13 +18,13 @@ def process_number() -> int:
 
 
 def weighed(mean: Tensor, kept: Tensor) -> Tensor:
-    """Weigh a process's mean over its elements (): the average over processes is that over all elements.
+    """Weigh a process's mean, (), so that the average over processes is the mean over all elements.
 
-    Otherwise a word or an action would weigh more beside padding. Every process must call it.
+    Otherwise a word or an action beside padding would weigh more. Every process must call this.
 
     Args:
         mean: (), over the elements that are kept.
-        kept: bool, which these are.
+        kept: bool, mask of these elements.
     """
     if not _are_several():
         return mean
@@ -35,9 +35,9 @@ def weighed(mean: Tensor, kept: Tensor) -> Tensor:
 
 
 class SavesTiedWeightsOnce(nn.Module):
-    """A policy whose checkpoints hold weights that modules share once, as strict loading demands.
+    """Mixin that saves weights shared by modules once, as strict loading demands.
 
-    FSDP gathers them once for each module. Stands before LeRobot's `PreTrainedPolicy`.
+    FSDP gathers them once for each module. It stands before LeRobot's `PreTrainedPolicy` among the bases.
     """
 
     config: Any

@@ -153,14 +153,14 @@ def check_state(config: Any, flags: Iterable[str]) -> None:
 
 
 def trained_with(config: Any, flags: Iterable[str]) -> dict[str, Any]:
-    """The values of flags, as JSON has them."""
+    """Return the values of flags, as JSON has them."""
     return json.loads(json.dumps({flag: getattr(config, flag) for flag in flags}))
 
 
 def check_as_trained(config: Any, flags: Iterable[str]) -> None:
     """Check that a checkpoint's flags are those that its weights were trained with.
 
-    ``flags``: today's; an older checkpoint names fewer.
+    ``flags`` are today's; an older checkpoint may lack some.
     """
     then = _then(config, flags)
     for flag, value in trained_with(config, then).items():
@@ -183,13 +183,13 @@ def check_weights_fit(config: Any, flags: Iterable[str]) -> None:
 
 
 def _then(config: Any, flags: Iterable[str]) -> dict[str, Any]:
-    """Return what a checkpoint was trained with, also by flags that it is older than."""
+    """Return the flags that a checkpoint was trained with, also those that are newer than it."""
     later = {flag: config.LATER_FIELDS[flag] for flag in flags if flag in config.LATER_FIELDS}
     return {**later, **(config.trained_with or {})}
 
 
 def action_deltas(config: Any) -> list[int] | None:
-    """Steps of the actions that a sample has, from its frame on.
+    """Return the steps of a sample's actions, counted from its frame.
 
     None for a chunk of one, which is the frame's own action: LeRobot reads that in a third of the time.
     """

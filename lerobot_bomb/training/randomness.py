@@ -13,7 +13,7 @@ from lerobot_bomb.training.distributed import process_number
 
 
 class CountsBatches(Protocol):
-    """A config that a checkpoint holds."""
+    """Config that counts the batches trained on."""
 
     trained_batches: int
 

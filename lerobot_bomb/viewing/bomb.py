@@ -30,7 +30,7 @@ GRID_RGB, NOMINAL_RGB, PATH_RGB = (200, 185, 160), (165, 165, 165), (210, 40, 30
 
 
 class BombView(EnvView):
-    """Flags are those of `record`; the expert can act."""
+    """View of `bomb`: the flags are those of `record`, and the expert can act."""
 
     def of_flags(self, flags: Mapping[str, Any]) -> Viewed:
         task_ids, size = flags["task_ids"], flags["image_size"]

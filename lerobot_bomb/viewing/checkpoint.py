@@ -52,7 +52,7 @@ class LoadedPolicy:
             self._env_processors = make_env_pre_post_processors(env_cfg=env_config, policy_cfg=config)
 
     def begin(self) -> None:
-        """Start an episode as the first one: with its random state."""
+        """Start an episode with the random state of the first one."""
         set_rng_state(self._random_state)
         self.policy.reset()
 
@@ -62,7 +62,7 @@ class LoadedPolicy:
         return self._env_processors[0](batch)
 
     def act(self, batch: dict[str, Any]) -> np.ndarray:
-        """(B, D) actions of the environment, for the output of `prepare`."""
+        """Return (B, D) actions of the environment, for the output of `prepare`."""
         with torch.inference_mode(), autocast(self.config):
             action = self.postprocess(self.policy.select_action(batch))
         return self._env_processors[1]({ACTION: action})[ACTION].to("cpu").numpy()
@@ -99,7 +99,7 @@ def load_policy(
 
 
 def scripted_agent(policy_type: str, env_type: str, env_flags: dict[str, Any], seed: int) -> BatchAgent:
-    """A policy without weights, built from its type.
+    """Build a policy without weights from its type.
 
     Raises:
         ValueError: the type has weights, which would be random ones.

@@ -41,7 +41,7 @@ class Viewed:
 
     @property
     def log(self) -> "type[EpisodeLog]":
-        """The class that writes its recording."""
+        """Class that writes its recording."""
         return resolve_name(self.log_at)
 
     def name(self, policy: str) -> str:
@@ -57,11 +57,11 @@ class EnvView(ABC):
 
     @abstractmethod
     def of_flags(self, flags: Mapping[str, Any]) -> Viewed:
-        """Return the episode of seed, perturbations, image_size and own flags; None if not given."""
+        """Return the episode of seed, perturbations, image_size and own flags, None if not given."""
 
     @abstractmethod
     def of_record(self, record: Any, spec: Any, depth: bool) -> Viewed:
-        """Return a spec's episode as a record's was shown, with depth if the policy saw it."""
+        """Return a spec's episode, shown like a record's, with depth if the policy saw it."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def write_episodes(runs: Mapping[str, ViewedRun], name: str, rrd: Path, mp4: Pat
 
 
 def paths_of(output: Path | None, folder: Path, name: str) -> list[Path]:
-    """Return both files of a user's `output`: its path without .rrd and .mp4, or a folder; None: `folder`."""
+    """Return the .rrd and .mp4 of a user's `output`, a path or an existing folder; None: in `folder`."""
     stem = output or folder / name
     if stem.is_dir():
         stem = stem / name

@@ -1,4 +1,4 @@
-"""The action grid that a policy would fit on a dataset, and its rounding errors.
+"""Action grid that a policy would fit on a dataset, and its rounding errors.
 
 Shapes: `N` actions, `D` action dims.
 """
@@ -51,10 +51,10 @@ def show_fit(
     options: dict[str, Any],
     plot: Path | None,
 ) -> None:
-    """Fit a grid on a dataset, print the tables, draw the plot; the flags' names say what they are.
+    """Fit a grid on a dataset, print the tables, draw the plot; arguments are the flags of these names.
 
     Raises:
-        ValueError: a setting is wrong, or the dataset has no such statistics.
+        ValueError: a setting is wrong, or the dataset lacks the statistics.
     """
     mode = mapping.get("ACTION", NormalizationMode.MIN_MAX)
     one_of("--policy.normalization_mapping[ACTION]", mode, [allowed.value for allowed in BOUND_STATISTICS])
@@ -98,10 +98,10 @@ def _write_plot(
 def dataset_action_bounds(
     meta: LeRobotDatasetMetadata, mode: NormalizationMode
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(D,) actions that become -1 and (D,) actions that become 1.
+    """Return the actions that become -1 and those that become 1, (D,) each.
 
     Raises:
-        ValueError: the dataset has no actions, or no such statistics of them.
+        ValueError: the dataset has no actions, or lacks the statistics of them.
     """
     if ACTION not in meta.features:
         raise ValueError(f"dataset {meta.repo_id} has no {ACTION!r}; it has {sorted(meta.features)}")
@@ -110,9 +110,9 @@ def dataset_action_bounds(
 
 
 def quantisation_errors(grids: ActionGrids, actions_ND: np.ndarray) -> dict[str, np.ndarray]:
-    """Mean absolute errors (D,) of normalised actions, clipping included.
+    """Return mean absolute errors (D,) of normalised actions, clipping included.
 
-    Of each decode point, of uniform edges with midpoints, and of clipping alone.
+    There is one for each decode point, for uniform edges with midpoints, and for clipping alone.
     """
     uniform = ActionGrids(replace(grids.settings, distribution="uniform", decode_point="mid"), grids.num_dims)
     uniform.fit(actions_ND, grids.rest.numpy())

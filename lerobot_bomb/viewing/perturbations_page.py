@@ -52,7 +52,7 @@ def write_page(path: Path, sheets: Path) -> None:
 
 
 def page(instructions: list[str], sheets: str) -> str:
-    """The Markdown text, with an instruction per level of `language` from 0 on and a link to the sheets."""
+    """Return the Markdown, with an instruction per level of `language` from 0 on and a link to the sheets."""
     sections = [axis_section(name, axis, sheets) for name, axis in AXES.items()]
     position = list(AXES).index("language")
     sections[position] += _forms(instructions)
@@ -61,7 +61,7 @@ def page(instructions: list[str], sheets: str) -> str:
 
 
 def example_instructions() -> list[str]:
-    """The instruction of one episode at the levels 0..5 of `language`."""
+    """Return the instructions of one episode at the levels 0..5 of `language`."""
     instructions = []
     for level in (0, *LEVELS):
         spec = EpisodeSpec(SEED, target=TARGET, color=COLOR, perturbations=f"language:{level}")
@@ -73,7 +73,7 @@ def example_instructions() -> list[str]:
 
 
 def axis_section(name: str, axis: Axis, sheets: str) -> str:
-    """An axis' heading, its magnitudes as a table, and a link to its sheet."""
+    """Write an axis' heading, its magnitudes as a table, and a link to its sheet."""
     lines = [
         f"## {name}",
         "",

@@ -21,11 +21,11 @@ from lerobot_bomb.viewing.episode import RANDOM, EnvView, Viewed
 from lerobot_bomb.viewing.sheet import text_tile
 
 ENV_ID = "lerobot_env_bomb_pusht:bomb_pusht/PushT-v0"
-PUSHED_STEPS = 6  # through the block, for what `dynamics` does
+PUSHED_STEPS = 6  # through the block, to show what `dynamics` does
 
 
 class PushTView(EnvView):
-    """The block's and the agent's way."""
+    """View of `bomb_pusht`, with its own flags."""
 
     flags: ClassVar = {
         "instruction": {"help": f"{' or '.join(INSTRUCTIONS)} (default: {INSTRUCTIONS[0]})"},
@@ -45,7 +45,7 @@ def _episode(spec: PushTSpec, image_size: int) -> Viewed:
     """Return an episode to be shown.
 
     Raises:
-        ValueError: gym-pusht is not installed, or draws no such images.
+        ValueError: gym-pusht is not installed, or draws no images of this size.
     """
     check_installed()
     check_image_size(image_size)

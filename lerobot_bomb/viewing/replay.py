@@ -32,8 +32,8 @@ class Replay:
         """Run the record's episode; under other perturbations, that of the same seed.
 
         Raises:
-            ValueError: its environment has no recording for Rerun, its batch cannot be run again, or, once
-                it runs, the policy is not that of the record or cannot be had.
+            ValueError: the environment has no recording for Rerun, the batch cannot be run again, or, once it
+                runs, the policy is missing or not that of the record.
         """
         row, size = self._place
         if size > MAX_BATCH or row >= size or row > self.record.spec.seed:

@@ -45,7 +45,7 @@ class BombLog(EpisodeLog[EpisodeSpec, EpisodeResult]):
 
     @staticmethod
     def layout(prefix: str) -> rrb.Horizontal:
-        """Cameras at the left, the scene over the words, curves at the right."""
+        """Lay out cameras at the left, the scene over the words, curves at the right."""
         eye = rrb.EyeControls3D(position=EYE_M, look_target=LOOK_AT_M, eye_up=(0.0, 0.0, 1.0))
         cameras = [rrb.Spatial2DView(origin=f"{prefix}camera/{camera}", name=camera) for camera in CAMERAS]
         instruction, result = text_views(prefix, "instruction", "result")
@@ -136,5 +136,5 @@ class BombLog(EpisodeLog[EpisodeSpec, EpisodeResult]):
 
 
 def describe_place(xy: np.ndarray) -> str:
-    """'target: row 1, column 3', or the tray."""
+    """Describe a target as 'target: row 1, column 3', or the tray."""
     return f"target: {place_name(xy)}"

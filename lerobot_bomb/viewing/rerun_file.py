@@ -23,7 +23,7 @@ CURVE_RGB = ((230, 75, 60), (70, 180, 90), (80, 140, 240), (240, 180, 50))
 def open_recording(
     path: Path, name: str, fps: int, layout: rrb.ContainerLike
 ) -> Iterator[rr.RecordingStream]:
-    """An .rrd that is being written; `layout` is what the viewer shows at first."""
+    """Open an .rrd for writing; `layout` is what the viewer shows at first."""
     recording = rr.RecordingStream(APPLICATION)
     blueprint = rrb.Blueprint(
         layout,
@@ -53,7 +53,7 @@ class EpisodeLog[SpecT, ResultT: Record](ABC):
                 self._log(f"{entity}/{name}", rr.SeriesLines(colors=[color], names=[name]), static=True)
 
     def add(self, moment: Moment) -> None:
-        """Log one moment; with the first, everything that stays; the instruction when it changes."""
+        """Log one moment; with the first also what does not move, and the instruction when it changes."""
         if moment.step == 0:
             self._log_still(moment)
         self._set_step(moment.step)
@@ -73,17 +73,17 @@ class EpisodeLog[SpecT, ResultT: Record](ABC):
     @staticmethod
     @abstractmethod
     def layout(prefix: str) -> rrb.Horizontal:
-        """Return what the viewer shows at first of the entities with this prefix."""
+        """Return the viewer's first layout of the entities with this prefix."""
 
     @staticmethod
     @abstractmethod
     def describe(result: ResultT) -> str:
-        """One line: success or the class of failure, after how many steps, how far from success."""
+        """Describe in one line: success or class of failure, number of steps, how far from success."""
 
     @staticmethod
     @abstractmethod
     def _timing_and_curves(spec: SpecT) -> tuple[int, Mapping[str, Sequence[str]]]:
-        """Control steps per second; {entity: names of its values}."""
+        """Return control steps per second, and {entity: names of its values}."""
 
     @abstractmethod
     def _log_still(self, moment: Moment) -> None:
@@ -91,7 +91,7 @@ class EpisodeLog[SpecT, ResultT: Record](ABC):
 
     @abstractmethod
     def _log_moment(self, moment: Moment) -> None:
-        """Log what is seen; the time is set, and the action is logged."""
+        """Log the observation; the caller sets the time and logs the action."""
 
     def _log(self, entity: str, what: rr.AsComponents, static: bool = False) -> None:
         self._recording.log(f"{self._prefix}{entity}", what, static=static, strict=True)
@@ -106,21 +106,21 @@ class EpisodeLog[SpecT, ResultT: Record](ABC):
 
 
 def text_views(prefix: str, *entities: str) -> list[rrb.TextDocumentView]:
-    """Return views of a text each, which stays until the next."""
+    """Return a view for each entity's text, which stays until the next."""
     return [rrb.TextDocumentView(origin=f"{prefix}{entity}", name=entity) for entity in entities]
 
 
 def curve_views(prefix: str, *entities: str) -> list[rrb.TimeSeriesView]:
-    """Return views of the curves below an entity each."""
+    """Return a view for the curves below each entity."""
     return [rrb.TimeSeriesView(origin=f"{prefix}{entity}", name=entity) for entity in entities]
 
 
 def describe_outcome(is_success: bool, failure: str | None, steps: int) -> str:
-    """'success after 20 steps', 'failed: dropped after 20 steps'."""
+    """Describe as 'success after 20 steps', 'failed: dropped after 20 steps'."""
     return f"{'success' if is_success else f'failed: {failure}'} after {steps} steps"
 
 
 def png(image: np.ndarray) -> rr.EncodedImage:
-    """(H, W, 3) uint8 without loss, in a third of its size."""
+    """Encode (H, W, 3) uint8 without loss, in a third of its size."""
     _, content = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     return rr.EncodedImage(contents=content.tobytes(), media_type="image/png")

@@ -19,7 +19,7 @@ CURVES: dict[str, tuple[str, ...]] = {
 
 
 class PushTLog(EpisodeLog[PushTSpec, PushTResult]):
-    """The policy's image, the agent, the block and its coverage of the target."""
+    """Log of an episode of PushT: the policy's image, agent, block and coverage of the target."""
 
     @staticmethod
     def describe(result: PushTResult) -> str:
@@ -29,7 +29,7 @@ class PushTLog(EpisodeLog[PushTSpec, PushTResult]):
 
     @staticmethod
     def layout(prefix: str) -> rrb.Horizontal:
-        """The image and the words at the left, curves at the right."""
+        """Lay out image and words at the left, curves at the right."""
         return rrb.Horizontal(
             rrb.Vertical(
                 rrb.Spatial2DView(origin=f"{prefix}camera", name="camera"),

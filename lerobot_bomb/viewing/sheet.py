@@ -1,4 +1,4 @@
-"""Contact sheets: rows of small images and of numbers under columns that have names."""
+"""Contact sheets: rows of small images and of numbers under named columns."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -27,7 +27,7 @@ class Sheet:
     label_width: int = LABEL_WIDTH  # pixels
 
     def draw(self) -> np.ndarray:
-        """(H, W, 3) uint8 with the unchanged tiles, each at its `tile_origin`."""
+        """Draw (H, W, 3) uint8 with the unchanged tiles, each at its `tile_origin`."""
         tile_height, tile_width = self._tile_shape
         width = self.label_width + len(self.columns) * (tile_width + GAP)
         height = self._top + len(self.images) * (tile_height + GAP)
@@ -92,7 +92,7 @@ def caption(text: str, last_line: str, width: int) -> np.ndarray:
 def _fitted(
     text: str, width: int, fits: Callable[[str, ImageFont.FreeTypeFont], bool]
 ) -> tuple[str, ImageFont.FreeTypeFont]:
-    """The text in lines of so many pixels at most, in the largest type that fits, or in the smallest."""
+    """Break a text into lines of so many pixels at most, in the largest type that fits, or the smallest."""
     for font_size in range(FONT_SIZE, MIN_FONT_SIZE - 1, -1):
         face = font(font_size)
         lines = _broken(text, face, width)
@@ -102,7 +102,7 @@ def _fitted(
 
 
 def _broken(text: str, face: ImageFont.FreeTypeFont, width: int) -> str:
-    """The text in lines of so many pixels at most."""
+    """Break a text into lines of so many pixels at most."""
     lines = [""]
     for word in text.split():
         longer = f"{lines[-1]} {word}".strip()

@@ -20,7 +20,7 @@ def packed(image: np.ndarray) -> np.ndarray:
 
 
 def unpacked(image: np.ndarray) -> np.ndarray:
-    """The inverse of `packed`."""
+    """Invert `packed`."""
     return np.asarray(cv2.imdecode(image, cv2.IMREAD_COLOR))
 
 
@@ -53,7 +53,7 @@ class VideoFile:
 
 
 def last_frame(path: Path) -> np.ndarray:
-    """(H, W, 3) uint8 of a video."""
+    """Return a video's last image, (H, W, 3) uint8."""
     with av.open(str(path)) as file:
         *_, frame = file.decode(video=0)
     return frame.to_ndarray(format="rgb24")

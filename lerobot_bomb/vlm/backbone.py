@@ -33,9 +33,9 @@ from lerobot_bomb.vlm.tokenizer import NANO, hub_file, load_tokenizer
 
 
 def as_it_was_computed() -> tuple[AbstractContextManager, AbstractContextManager]:
-    """Contexts of a checkpointed layer and of its recomputation, which has the kernels that are allowed now.
+    """Return contexts of a checkpointed layer and of its recomputation, with the kernels allowed now.
 
-    Torch itself sees to autocast and random numbers.
+    Torch itself restores autocast and random state.
     """
     is_restricted = not torch.backends.cuda.flash_sdp_enabled()
     return nullcontext(), sdpa_kernel(SDPBackend.MATH) if is_restricted else nullcontext()
@@ -71,9 +71,9 @@ class Backbone(nn.Module):
         return self.vlm.get_input_embeddings()(tokens_BL)
 
     def head(self, token_ids: Tensor) -> Callable[[Tensor], Tensor]:
-        """The output head of a few tokens, in float32: (..., H) -> (..., len(token_ids)).
+        """Return the output head of a few tokens, in float32: (..., H) -> (..., len(token_ids)).
 
-        In bfloat16 the likeliest of ten digits is often one of several, of which argmax takes the lowest.
+        In bfloat16 several of ten digits are often equally likely, and argmax takes the lowest.
         """
         head = self.vlm.lm_head
         if type(head) is not nn.Linear:  # such as one with an adapter
@@ -129,7 +129,7 @@ class SmolVLMBackbone(Backbone):
     def hidden_states(
         self, embeds_BLH: Tensor, image_columns: Tensor | None = None, hidden_BL: Tensor | None = None
     ) -> Tensor:
-        """Embeddings of rows that start with their tokens -> (B, L, H) states after the last layer.
+        """Embeddings (B, L, H), padded on the right -> (B, L, H) states after the last layer.
 
         Attention is causal, so what follows a row's end changes nothing before it. ``hidden_BL``: tokens that
         no other reads.
@@ -157,12 +157,12 @@ def exact_linear(hidden: Tensor, weight: Tensor) -> Tensor:
 def load_backbone(
     vlm_model_name: str, changes: Mapping[str, Any] | None = None, image_size: int | None = None
 ) -> SmolVLMBackbone:
-    """Backbone with pretrained weights of a Hub id or a local folder, or ``nano`` with random ones.
+    """Load a backbone with the weights of a Hub id or a local folder, or ``nano`` with random ones.
 
-    ``changes``: of nano's architecture; ``image_size``: that the model must have, if any.
+    ``changes`` alter nano's architecture; the model must have ``image_size``, if any.
 
     Raises:
-        OSError: config or weights cannot be had; the message names the ways out.
+        OSError: config or weights cannot be read; the message names the ways out.
         ValueError: as `check_family` and `changed`, weights are not finite, or images have another size.
     """
     if vlm_model_name == NANO:
@@ -188,11 +188,11 @@ def _check_image_size(own: int, asked: int | None) -> None:
 
 
 def check_family(vlm_model_name: str, *families: str) -> str:
-    """Return the family of a base model, one that the policy has a backbone for; ``nano`` is the first.
+    """Return the family of a base model, one of ``families``; for ``nano`` the first.
 
     Raises:
         OSError: there is no config; the message names the ways out.
-        ValueError: it is another family's, or a policy's.
+        ValueError: the config is another family's, or a policy's.
     """
     if vlm_model_name == NANO:
         return families[0]
@@ -218,7 +218,7 @@ def check_family(vlm_model_name: str, *families: str) -> str:
 
 
 def read_vlm_config(vlm_model_name: str, *families: str) -> Any:
-    """Config of a Hub id or a local folder; raises as `check_family`."""
+    """Read the config of a Hub id or a local folder; raises as `check_family`."""
     check_family(vlm_model_name, *families)
     return AutoConfig.from_pretrained(vlm_model_name)
 
@@ -241,8 +241,8 @@ def spread_images(vision_model: nn.Module) -> None:
     """Let random weights tell different images apart, and go on doing so while they are trained.
 
     Most of a robot's image is even and never changes: filters of zero mean turn an even patch into nothing.
-    Patch and position embeddings start at unit scale: at that of the other weights, what Adam's first hundred
-    steps add to the vision model's biases is larger, and every image's features become the same.
+    Patch and position embeddings start at unit scale. At the scale of the other weights, Adam's first hundred
+    steps would add more to the vision model's biases, and every image's features would become the same.
     """
     embeddings = next(module for name, module in vision_model.named_modules() if name.endswith("embeddings"))
     filters = embeddings.get_submodule("patch_embedding").weight
@@ -262,7 +262,7 @@ def spread_filters(filters: Tensor) -> None:
 def build_backbone(
     vlm_config: dict[str, Any], image_size: int | None = None, dtype: torch.dtype = torch.float32
 ) -> SmolVLMBackbone:
-    """Backbone of the given architecture, as `random_model`; raises as `load_backbone`."""
+    """Build the given architecture as `random_model` does; raises as `load_backbone`."""
 
     def build() -> PreTrainedModel:
         config_class, model_class = SmolVLMBackbone.classes[vlm_config["model_type"]]
@@ -277,9 +277,9 @@ def build_backbone(
 def random_model(
     model_class: type[PreTrainedModel], config: Any, dtype: torch.dtype, **options: Any
 ) -> PreTrainedModel:
-    """A model with random weights, those of its layers' products in ``dtype`` and all others in float32.
+    """Build a model with random weights, those of its layers' products in ``dtype``, all others in float32.
 
-    Products are what autocast casts at every call, so casting them once and for all changes no answer.
+    Autocast casts products at every call, so casting them once and for all changes no output.
     """
     for part in (config, config.text_config, config.vision_config):
         part.dtype = dtype
@@ -292,5 +292,5 @@ def random_model(
 
 
 def config_dict(vlm: PreTrainedModel) -> dict[str, Any]:
-    """The architecture as a JSON-ready dict, as `build_backbone` takes it."""
+    """Return the architecture as a JSON-ready dict, as `build_backbone` takes it."""
     return json.loads(vlm.config.to_json_string(use_diff=False))

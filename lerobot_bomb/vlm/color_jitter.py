@@ -22,10 +22,10 @@ UNCHANGED = (1.0, 1.0, 1.0, 0.0)
 
 @dataclass(frozen=True)
 class ColorJitter:
-    """Colour jitter by factors that say how far colours may change; 0 leaves them.
+    """Colour jitter; each field x says how far its property may change, 0 not at all.
 
-    Factors are drawn from 1 - x to 1 + x, a turn of the hue from -x to x of a whole one. They are applied in
-    a random order, as torchvision's class of this name does.
+    Factors are drawn from 1 - x to 1 + x, the turn of the hue from -x to x of a full turn. They are applied
+    in a random order, as torchvision's class of this name does.
     """
 
     brightness: float

@@ -29,8 +29,8 @@ def observed_depth(batch: Mapping[str, Tensor], camera: str, image_size: tuple[i
     """(B, H, W) metres of a camera's whole images, NaN where unknown. The input may be (B, 1, H, W).
 
     Raises:
-        KeyError: it is missing.
-        ValueError: it is not that of images of ``image_size`` (height, width), or not in metres.
+        KeyError: the batch lacks it.
+        ValueError: its size is not ``image_size`` (height, width), or it is not in metres.
     """
     key = f"observation.depth.{camera}"
     if key not in batch:
@@ -63,12 +63,12 @@ def observed_intrinsics(
 ) -> Tensor:
     """K, (B, 3, 3) or (1, 3, 3), of a camera's whole images, counted from their edges.
 
-    ``camera_intrinsics`` of the config come first, then the observation's, then ``default_K_133``. The former
+    ``camera_intrinsics`` of the config come first, then the observation's, then ``default_K_133``. The first
     two count from the centre of the top left pixel.
 
     Raises:
         KeyError: none of them is there.
-        ValueError: it is not a pinhole camera's.
+        ValueError: K is not a pinhole camera's.
     """
     key = f"observation.intrinsics.{camera}"
     if camera in camera_intrinsics:
@@ -89,8 +89,9 @@ def observed_intrinsics(
 def lattice_points(depth_BHW: Tensor, K_B33: Tensor, size: int) -> Tensor:
     """Depth and K of the same images -> (B, R, R, 3) metres at the centres of R = ``size`` cells a side.
 
-    NaN where depth is missing. Each point takes the depth of the pixel that it lies in. The original
-    pools, which blends near and far at edges: that puts 7 % of BOMB's points more than 10 mm off, this 0.6 %.
+    NaN where depth is missing. Each point takes the depth of the pixel that it lies in. The original pools
+    depth, which blends near and far at edges: that puts 7 % of BOMB's points more than 10 mm off, this way
+    0.6 %.
     """
     height, width = depth_BHW.shape[-2:]
     rows, columns = (_nearest_pixels(side, size, depth_BHW.device) for side in (height, width))
@@ -142,7 +143,7 @@ def _zoedepth_margin(size: int) -> int:
 
 
 def build_zoedepth(depth_config: dict[str, Any]) -> ZoeDepth:
-    """The architecture of a checkpoint, with random weights."""
+    """Build a checkpoint's architecture with random weights."""
     from transformers import ZoeDepthConfig, ZoeDepthForDepthEstimation
 
     return ZoeDepth(ZoeDepthForDepthEstimation(ZoeDepthConfig(**depth_config)))
@@ -152,7 +153,7 @@ def load_zoedepth(depth_model_name: str) -> ZoeDepth:
     """Load the weights of a Hub id or a local folder.
 
     Raises:
-        OSError: they cannot be read; the message says what to do.
+        OSError: the weights cannot be read; the message says what to do.
     """
     from transformers import ZoeDepthForDepthEstimation  # only who asks for it pays for it
 
@@ -163,7 +164,7 @@ def load_zoedepth(depth_model_name: str) -> ZoeDepth:
 
 
 def read_zoedepth_config(depth_model_name: str) -> dict[str, Any]:
-    """The architecture of a Hub id or a local folder, for `build_zoedepth`; raises as `load_zoedepth`."""
+    """Read the architecture of a Hub id or local folder for `build_zoedepth`; raises like `load_zoedepth`."""
     from transformers import ZoeDepthConfig
 
     with _ways_out(depth_model_name):

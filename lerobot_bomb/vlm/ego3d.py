@@ -58,7 +58,7 @@ class Ego3D(nn.Module):
 
     @property
     def lattice_size(self) -> int:
-        """R."""
+        """R, points on a side of the lattice."""
         return self.patches_per_side * self.patch_reso
 
     def forward(self, points_BRR3: Tensor) -> Tensor:

@@ -36,7 +36,7 @@ def encode_images(encoder: ImageEncoder, cameras: Sequence[Tensor]) -> Tensor:
 
 @dataclass(frozen=True)
 class CropWindows:
-    """Windows in which each image of a batch is cut, in its pixels; all windows are equally large."""
+    """Crop windows of a batch of images, in their pixels; all are equally large."""
 
     offsets: Tensor  # (B, 2) integers: first line and first column of each window
     height: int
@@ -44,7 +44,7 @@ class CropWindows:
     image_size: tuple[int, int]  # height, width of the whole images
 
     def cut(self, images_BxHW: Tensor) -> Tensor:
-        """(B, ..., H, W) -> (B, ..., height, width): images, or what lies on the same pixels, as depth."""
+        """(B, ..., H, W) -> (B, ..., height, width): images, or values of the same pixels such as depth."""
         offsets = self.offsets.tolist()
         return torch.stack(
             [
@@ -55,7 +55,7 @@ class CropWindows:
 
 
 def draw_windows(images_BxHW: Tensor, crop_fraction: float, generator: torch.Generator | None) -> CropWindows:
-    """Windows of ``crop_fraction`` of either side of (B, ..., H, W) images.
+    """Draw windows of ``crop_fraction`` of either side of (B, ..., H, W) images.
 
     Each is placed by ``generator``, or at the centre if that is None.
     """
@@ -77,7 +77,7 @@ def crop(images_BxHW: Tensor, crop_fraction: float, generator: torch.Generator |
 def resized_pixels(images_B3HW: Tensor, size: int) -> Tensor:
     """(B, 3, H, W) in [0, 1] -> (B, 3, size, size) in [-1, 1]; see `resize`.
 
-    As SmolVLM's own processor does it with ``do_resize=False, do_image_splitting=False``.
+    SmolVLM's own processor does this with ``do_resize=False, do_image_splitting=False``.
     """
     return _resized_levels(images_B3HW, size).mul_(2 / 255).sub_(1)
 
@@ -85,9 +85,9 @@ def resized_pixels(images_B3HW: Tensor, size: int) -> Tensor:
 def resize(images_B3HW: Tensor, size: int) -> Tensor:
     """(B, 3, H, W) in [0, 1] -> (B, 3, size, size) in [0, 1], as Pillow's Lanczos filter does it.
 
-    That is what ``AutoProcessor`` uses for SmolVLM. Lines first, then columns, each the product with a
-    fixed matrix; like Pillow's, both results are 8 bit levels, so overshoot at edges is cut off in between.
-    Images that are not square are stretched. Equal to Pillow's but for a level where rounding is a tie.
+    ``AutoProcessor`` uses that for SmolVLM. Lines are resampled first, then columns, each by a product with a
+    fixed matrix. As in Pillow, both results are 8-bit levels, so overshoot at edges is cut off in between.
+    Images that are not square are stretched. The result is Pillow's, but for a level where rounding is a tie.
     """
     return _resized_levels(images_B3HW, size).div_(255)
 
@@ -110,8 +110,8 @@ def _round_levels(levels: Tensor) -> Tensor:
 def lanczos_weights(old_size: int, new_size: int, device: torch.device) -> Tensor:
     """Matrix (new_size, old_size) that resamples a line of pixels; its rows sum to 1.
 
-    When it shrinks a line, the filter is widened by as much. On CUDA in float64: LeRobot allows TF32 there,
-    whose rounding would be off by two levels.
+    When a line shrinks, the filter is widened by as much. On CUDA the matrix is float64: LeRobot allows TF32
+    there, whose rounding would be off by two levels.
     """
     scale = old_size / new_size  # old pixels per new one
     centres_N1 = (torch.arange(new_size, dtype=torch.float64)[:, None] + 0.5) * scale

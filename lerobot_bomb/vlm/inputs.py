@@ -9,14 +9,14 @@ from lerobot_bomb.finite import require_finite_batch
 
 # (B, S) bool, tokens of the instruction that no other token reads; their positions stay theirs
 OBS_LANGUAGE_HIDDEN = f"{OBS_LANGUAGE_TOKENS}.hidden"
-# on CUDA, instructions of any length up to a multiple share what is recorded
+# on CUDA, instructions are padded to a multiple of this, so that they share captured graphs
 TEXT_COLUMNS = 16
 
 
 def read_tensor(batch: dict[str, Tensor], key: str, policy_type: str, device: torch.device) -> Tensor:
-    """The batch's value; an error if it is absent, on another device or, on the CPU, not finite or in range.
+    """Return a batch's value; raise if absent, on another device or, on the CPU, not finite or in range.
 
-    On CUDA the host would have to wait; `TaskStep` looks at a batch before.
+    On CUDA the host would have to wait for the last check; `TaskStep` makes it before.
     """
     if key not in batch:
         raise KeyError(f"{policy_type} needs {key!r}; the batch has {sorted(batch)}")
@@ -28,7 +28,7 @@ def read_tensor(batch: dict[str, Tensor], key: str, policy_type: str, device: to
 
 
 def read_image(batch: dict[str, Tensor], key: str, policy_type: str, device: torch.device) -> Tensor:
-    """(B, 3, H, W) floats in [0, 1]."""
+    """Read images (B, 3, H, W), floats in [0, 1]."""
     image_B3HW = read_tensor(batch, key, policy_type, device)
     if image_B3HW.ndim != 4 or image_B3HW.shape[1] != 3 or not image_B3HW.is_floating_point():
         raise ValueError(
@@ -39,7 +39,7 @@ def read_image(batch: dict[str, Tensor], key: str, policy_type: str, device: tor
 
 
 def read_state(batch: dict[str, Tensor], policy_type: str, device: torch.device, num_dims: int) -> Tensor:
-    """(B, S) of the robot's normalised state."""
+    """Read the robot's normalised state, (B, S)."""
     state_BS = read_tensor(batch, OBS_STATE, policy_type, device)
     if state_BS.ndim != 2 or state_BS.shape[1] != num_dims:
         raise ValueError(
@@ -50,7 +50,7 @@ def read_state(batch: dict[str, Tensor], policy_type: str, device: torch.device,
 
 
 def read_task(batch: dict[str, Tensor], policy_type: str, device: torch.device) -> TokenRows:
-    """The instructions' tokens, with padding."""
+    """Read the instructions' tokens, with padding."""
     ids_BL, mask_BL = (
         read_tensor(batch, key, policy_type, device)
         for key in (OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)
@@ -65,7 +65,7 @@ def read_task(batch: dict[str, Tensor], policy_type: str, device: torch.device) 
 def read_actions(
     batch: dict[str, Tensor], key: str, policy_type: str, device: torch.device, shape: tuple[int, int]
 ) -> Tensor:
-    """(B, T, D) of the given ``shape`` (T, D); one action may come as (B, D), one dimension as (B, T)."""
+    """Read actions (B, T, D) of ``shape`` (T, D); one action may come as (B, D), one dimension as (B, T)."""
     actions_BTD = read_tensor(batch, key, policy_type, device)
     if actions_BTD.ndim == 2 and 1 in shape and actions_BTD.shape[1] == max(shape):
         actions_BTD = actions_BTD.unflatten(1, shape)

@@ -16,7 +16,7 @@ DEFAULT_HEIGHT_PX, DEFAULT_WIDTH_PX = 480, 640
 
 
 def default_intrinsics(height: int, width: int) -> Tensor:
-    """(1, 3, 3) K of a camera that nothing is known of; its images are stretched to height x width."""
+    """Return K (1, 3, 3) of an unknown camera whose images are stretched to height x width."""
     center_x, center_y = DEFAULT_CENTER_PX
     K = torch.tensor([[[DEFAULT_FOCAL_PX, 0, center_x], [0, DEFAULT_FOCAL_PX, center_y], [0, 0, 1]]])
     return resize_intrinsics(K, (DEFAULT_HEIGHT_PX, DEFAULT_WIDTH_PX), (height, width))
@@ -26,7 +26,7 @@ def from_pixel_centers(K_B33: Tensor, name: str) -> Tensor:
     """K as calibrations and `bomb/observation.py` have it, (0, 0) the centre of the top left pixel -> ours.
 
     Raises:
-        ValueError: it is not a pinhole camera's; the message calls it ``name``.
+        ValueError: K is not a pinhole camera's; the message calls it ``name``.
     """
     K_B33 = K_B33.float()
     is_shaped = K_B33.ndim == 3 and K_B33.shape[1:] == (3, 3)
@@ -63,7 +63,7 @@ def resize_intrinsics(K_B33: Tensor, old_size: tuple[int, int], new_size: tuple[
 def back_project(depth_BRR: Tensor, K_B33: Tensor) -> Tensor:
     """(B, R, R) metres along the optical axis -> (B, R, R, 3) metres, x right, y down, z forward.
 
-    Points of the scene at the centres of the pixels. Without a matrix product, which autocast would round.
+    These are the scene's points at the pixels' centres. No matrix product, which autocast would round.
     """
     centers_R = torch.arange(depth_BRR.shape[-1], device=depth_BRR.device) + 0.5
     focal_B2, principal_B2 = K_B33[:, [0, 1], [0, 1]], K_B33[:, :2, 2]

@@ -31,11 +31,11 @@ class Piece(NamedTuple):
 class PromptLayout:
     """Pieces of a prompt, in order.
 
-    No text of its own comes before an image of a row, so an image's columns are the same in every row.
+    No row has tokens of its own before an image, so an image's columns are the same in every row.
     """
 
     pieces: Sequence[Piece]
-    image: int  # token whose embedding an image feature takes the place of
+    image: int  # token whose embedding an image feature replaces
 
     @property
     def num_tokens(self) -> int:

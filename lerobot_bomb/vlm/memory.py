@@ -16,7 +16,7 @@ def check_memory(vlm_config: dict[str, Any], build: Callable[[], nn.Module], dty
     ``dtype``: of most of its weights.
 
     Raises:
-        ValueError: it has not, or there is no such model.
+        ValueError: the model does not fit, or the config describes none.
     """
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     try:

@@ -35,7 +35,7 @@ class PaliGemmaPrompt:
 
     @classmethod
     def from_tokenizer(cls, tokenizer: Tokenizer, vlm_model_name: str) -> "PaliGemmaPrompt":
-        """Look everything up.
+        """Look up all tokens.
 
         Raises:
             ValueError: a digit, the space or a special token is not exactly one token.
@@ -52,7 +52,7 @@ class PaliGemmaPrompt:
         )
 
     def to_dict(self) -> dict[str, int | list[int]]:
-        """JSON-ready."""
+        """Return a JSON-ready dict."""
         return asdict(self)
 
 
@@ -60,7 +60,7 @@ class PaliGemmaBackbone(Backbone):
     """A stock ``PaliGemmaForConditionalGeneration`` with Gemma 2, called in parts.
 
     Gemma 2 multiplies embeddings by sqrt(H); transformers 5 does so inside ``embed_tokens``, and image
-    features are not divided by it. What else becomes the text model's input is to be of that scale.
+    features are not divided by it. Any other input of the text model must have that scale.
     """
 
     # the family of its base models, as their config.json names it
@@ -101,7 +101,7 @@ class PaliGemmaBackbone(Backbone):
     def hidden_states(self, embeds_BLH: Tensor, columns_BL: Tensor, attention_mask_BLL: Tensor) -> Tensor:
         """(B, L, H) states after the last layer.
 
-        ``columns_BL``: places in the sequence, from 0; ``attention_mask_BLL``: bool, row: who attends.
+        ``columns_BL``: places in a sequence, from 0; ``attention_mask_BLL``: bool, a row per attending token.
         """
         mask = attention_bias(attention_mask_BLL, embeds_BLH.dtype)
         return self.text_model(
@@ -112,17 +112,17 @@ class PaliGemmaBackbone(Backbone):
         ).last_hidden_state
 
     def cap(self, logits: Tensor) -> Tensor:
-        """Gemma 2's soft limit of logits, which keeps their order."""
+        """Apply Gemma 2's soft limit of logits, which keeps their order."""
         return logits if self.softcap is None else self.softcap * torch.tanh(logits / self.softcap)
 
 
 def load_paligemma(vlm_model_name: str, changes: Mapping[str, Any] | None = None) -> PaliGemmaBackbone:
-    """Backbone with pretrained weights of a Hub id or a local folder, or ``nano`` with random ones.
+    """Load a backbone with the weights of a Hub id or a local folder, or ``nano`` with random ones.
 
-    ``changes``: of nano's architecture.
+    ``changes`` alter nano's architecture.
 
     Raises:
-        OSError: config or weights cannot be had; the message names the ways out.
+        OSError: config or weights cannot be read; the message names the ways out.
         ValueError: the model is not a PaliGemma 2, or as `check_family` and `changed`.
     """
     if vlm_model_name == NANO:
@@ -147,7 +147,7 @@ def load_paligemma(vlm_model_name: str, changes: Mapping[str, Any] | None = None
 
 
 def build_paligemma(vlm_config: dict[str, Any], dtype: torch.dtype = torch.float32) -> PaliGemmaBackbone:
-    """Backbone of the given architecture, as `random_model`."""
+    """Build the given architecture as `random_model` does."""
 
     def build() -> Any:
         config = PaliGemmaConfig(**vlm_config)

@@ -33,7 +33,7 @@ class Prefix:
 
     @classmethod
     def of(cls, tensors: Sequence[Tensor]) -> "Prefix":
-        """The inverse of `tensors`."""
+        """Invert `tensors`."""
         hidden, attention_mask, next_position, *layers = tensors
         return cls(hidden, attention_mask, next_position, list(zip(layers[::2], layers[1::2], strict=True)))
 

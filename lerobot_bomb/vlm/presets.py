@@ -29,7 +29,7 @@ NANO_TEXT = {
 }
 
 
-# what tokens are numbered by belongs to the tokenizer, and the family to the policy
+# the numbering of tokens belongs to the tokenizer, and the family to the policy
 FIXED = ("model_type", "vocab_size")
 
 

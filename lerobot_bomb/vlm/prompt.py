@@ -1,4 +1,4 @@
-"""The fixed parts of the prompt as token ids, in the chat format of a family of models.
+"""Fixed parts of the prompt as token ids, in the chat format of a family of models.
 
 The whole sequence is, in SmolVLM's:
 
@@ -60,7 +60,7 @@ class ChatFormat:
     image_label: str = ""  # after an image's start
 
     def opening(self, tokenizer: Tokenizer, vlm_model_name: str, system_prompt: str | None) -> list[int]:
-        """Tokens before the user's images; raises like `single_id`."""
+        """Return the tokens before the user's images; raises as `single_id`."""
         ids = [single_id(tokenizer, vlm_model_name, self.family, self.start)]
         text = self.default_system if system_prompt is None else system_prompt
         if text is not None:
@@ -69,7 +69,7 @@ class ChatFormat:
         return [*ids, *token_ids(tokenizer, self.user)]
 
     def reply(self, tokenizer: Tokenizer, vlm_model_name: str) -> list[int]:
-        """Tokens between the user's text and the model's; raises as `single_id`."""
+        """Return the tokens between the user's text and the model's; raises as `single_id`."""
         return [*self._next(tokenizer, vlm_model_name), *token_ids(tokenizer, self.assistant)]
 
     def _next(self, tokenizer: Tokenizer, vlm_model_name: str) -> list[int]:
@@ -133,7 +133,7 @@ class PromptTokens:
         system_prompt: str | None = None,
         chat: ChatFormat = SMOLVLM_CHAT,
     ) -> "PromptTokens":
-        """Look everything up.
+        """Look up all tokens.
 
         Raises:
             ValueError: a digit, the space or a special token is not exactly one token of its own, or not
@@ -158,12 +158,12 @@ class PromptTokens:
         )
 
     def to_dict(self) -> dict[str, int | list[int] | str | None]:
-        """JSON-ready."""
+        """Return a JSON-ready dict."""
         return asdict(self)
 
 
 def _check_distinct(symbols: dict[str, int], vlm_model_name: str) -> None:
-    """Raise if two symbols are the same token, as all that a tokenizer does not know are."""
+    """Raise if two symbols are the same token, as all unknown ones are."""
     texts: dict[int, str] = {}
     for text, token in symbols.items():
         if token in texts:
@@ -178,9 +178,9 @@ def _check_distinct(symbols: dict[str, int], vlm_model_name: str) -> None:
 def _check_numbers(
     tokenizer: Tokenizer, symbols: dict[str, int], chat: ChatFormat, vlm_model_name: str
 ) -> None:
-    """Raise unless every number of up to MAX_DIGITS digits is a space and one token a digit, where it stands.
+    """Raise unless every number of up to MAX_DIGITS digits is a space and one token per digit in place.
 
-    The policy turns numbers into tokens by arithmetic and asks no tokenizer: this is its only check. 0.2 s.
+    The policy turns numbers into tokens by arithmetic, without a tokenizer; only this, in 0.2 s, checks it.
     """
     numbers = [f" {number:0{width}}" for width in range(1, MAX_DIGITS + 1) for number in range(10**width)]
     # all of them one after the other, and every digit as the last
@@ -209,24 +209,24 @@ def normalize_task(task: str) -> str:
 def check_template(template: object, name: str) -> None:
     """Raise a ValueError unless the template holds ``{}`` once, for the instruction.
 
-    ``name``: what the message calls it.
+    ``name``: what the message calls the template.
     """
     if not isinstance(template, str) or re.findall(r"[{}]+", template) != ["{}"]:
         raise ValueError(f"{name}={template!r} must hold {{}} once, for the task, and no other brace")
 
 
 def task_text(task: str, template: str = TASK_TEMPLATE) -> str:
-    """The prompt's task part; ``{}`` in the template stands for the task."""
+    """Return the prompt's task part; ``{}`` in the template stands for the task."""
     return template.format(normalize_task(task))
 
 
 def task_ids(tokenizer: Tokenizer, task: str, template: str = TASK_TEMPLATE) -> list[int]:
-    """Tokens of the prompt's task part."""
+    """Return the tokens of the prompt's task part."""
     return text_ids(tokenizer, task_text(task, template))
 
 
 def text_ids(tokenizer: Tokenizer, text: str) -> list[int]:
-    """Tokens of a user's text; text that looks like a special token stays text."""
+    """Return the tokens of a user's text; text that looks like a special token stays text."""
     tokenizer.encode_special_tokens = True
     try:
         return tokenizer.encode(text, add_special_tokens=False).ids

@@ -1,7 +1,7 @@
 """Qwen2.5-VL behind the few operations a policy needs.
 
-A prefix (images and text) is read once; short segments of embeddings then go on from it, as often as
-wanted, and change nothing of what is kept.
+A prefix (images and text) is read once; short segments of embeddings then continue it, as often as wanted,
+and change nothing that is kept.
 
 Shapes: `B` batch, `L` tokens of a prefix, `T` of a segment, `H` hidden size, `P` tokens of an image, `S` side
 of an image in pixels, `V` key-value heads, `E` size of a head.
@@ -50,7 +50,7 @@ class QwenPrompt:
 
     @classmethod
     def from_tokenizer(cls, tokenizer: Tokenizer, vlm_model_name: str) -> "QwenPrompt":
-        """Look everything up.
+        """Look up all tokens.
 
         Raises:
             ValueError: a special token is not exactly one token.
@@ -65,7 +65,7 @@ class QwenPrompt:
         )
 
     def to_dict(self) -> dict[str, int | list[int]]:
-        """JSON-ready."""
+        """Return a JSON-ready dict."""
         return asdict(self)
 
 
@@ -124,7 +124,7 @@ class QwenBackbone(Backbone):
         return embed_patches(self.vlm.model.visual, patches, len(pixels_B3SS), side)
 
     def _patches(self, pixels_B3SS: Tensor) -> Tensor:
-        """A row of values for each patch, as a film of equal frames; the patches of a token in a row."""
+        """Return a row per patch, as a film of equal frames; a token's patches are consecutive."""
         side = self.tokens_per_side, self._merge, self._patch
         cells = pixels_B3SS.unflatten(3, side).unflatten(2, side)  # B, 3, line, its patch, pixel, column, ...
         cells = cells.permute(0, 2, 5, 3, 6, 1, 4, 7)  # B, line, column, patch, patch, 3, pixel, pixel
@@ -139,7 +139,7 @@ class QwenBackbone(Backbone):
     def hidden_states(
         self, embeds_BLH: Tensor, image_columns: Tensor, hidden_BL: Tensor | None = None
     ) -> Tensor:
-        """Embeddings of rows that start with their tokens -> (B, L, H) states after the last layer.
+        """Embeddings (B, L, H), padded on the right -> (B, L, H) states after the last layer.
 
         ``image_columns``: the images' columns, the same in every row. Attention is causal, so what follows a
         row's end changes nothing before it. ``hidden_BL``: tokens that no other reads.
@@ -159,8 +159,8 @@ class QwenBackbone(Backbone):
     ) -> Prefix:
         """Read rows from their first column on; ``is_image_BL``: which tokens belong to images.
 
-        ``hidden_BL``: tokens that no other reads. They keep their positions. ``num_shared``: first columns
-        that are written and the same in all rows; they are read once.
+        ``hidden_BL``: tokens that no other reads. They keep their positions. ``num_shared``: first columns,
+        without padding, that are the same in all rows; they are read once.
         """
         positions_3BL, next_B1 = self._positions(is_image_BL, mask_BL)
         attention_mask_BL = mask_BL if hidden_BL is None else mask_BL & ~hidden_BL
@@ -189,7 +189,7 @@ class QwenBackbone(Backbone):
     def read_segment(
         self, prefix: Prefix, embeds_BTH: Tensor, attention_mask_BTT: Tensor, num_copies: int = 1
     ) -> Tensor:
-        """(B, T, H) states after the last layer of tokens that follow a prefix and read all of it.
+        """Return (B, T, H) states after the last layer of tokens that follow a prefix and read all of it.
 
         ``attention_mask_BTT``: of the segment's tokens among themselves. ``num_copies``: equally long parts
         of the segment, each placed right behind the prefix.
@@ -207,7 +207,7 @@ class QwenBackbone(Backbone):
         attention_mask_BTX: Tensor,
         kept: list[KeysValues] | None = None,
     ) -> tuple[Tensor, list[KeysValues]]:
-        """States after the last layer, and the keys and values of every layer."""
+        """Return states after the last layer, and the keys and values of every layer."""
         rotation = self.text_model.rotary_emb(x_BTH, positions_3BT)
         read: Any = _read_layer
         if self._is_checkpointed and torch.is_grad_enabled():
@@ -219,10 +219,10 @@ class QwenBackbone(Backbone):
         return self.text_model.norm(x_BTH), layers
 
     def _positions(self, is_image_BL: Tensor, mask_BL: Tensor) -> tuple[Tensor, Tensor]:
-        """(3, B, L) time, line and column that the model takes a token to be at, and (B, 1) what follows.
+        """Return each token's time, line and column, (3, B, L), and the position of what follows, (B, 1).
 
-        Text moves all three on by one. An image stands still in time, its lines and columns count from
-        there, and what follows it is at the first place beyond.
+        A text token advances all three by one. An image stands still in time; its lines and columns count
+        from there, and the next token takes the first position beyond.
         """
         side = self.tokens_per_side
         place_BL = (is_image_BL.cumsum(dim=1) - 1) % side**2
@@ -235,10 +235,10 @@ class QwenBackbone(Backbone):
 
 
 def _tokens_per_side(vision_config: Any, image_size: int) -> int:
-    """Return how many tokens a line of an image is.
+    """Return how many tokens a line of an image has.
 
     Raises:
-        ValueError: not a whole number.
+        ValueError: it is not a whole number.
     """
     patch, merge = vision_config.patch_size, vision_config.spatial_merge_size
     if image_size < 1 or image_size % (patch * merge):
@@ -264,12 +264,12 @@ def _read_layer(
 
 
 def load_qwen(vlm_model_name: str, image_size: int, changes: Mapping[str, Any] | None = None) -> QwenBackbone:
-    """Backbone with pretrained weights of a Hub id or a local folder, or ``nano`` with random ones.
+    """Load a backbone with the weights of a Hub id or a local folder, or ``nano`` with random ones.
 
-    ``changes``: of nano's architecture.
+    ``changes`` alter nano's architecture.
 
     Raises:
-        OSError: config or weights cannot be had; the message names the ways out.
+        OSError: config or weights cannot be read; the message names the ways out.
         ValueError: as `check_family`, `changed` and `QwenBackbone`.
     """
     if vlm_model_name == NANO:
@@ -289,7 +289,7 @@ def load_qwen(vlm_model_name: str, image_size: int, changes: Mapping[str, Any] |
 def build_qwen(
     vlm_config: dict[str, Any], image_size: int, dtype: torch.dtype = torch.float32
 ) -> QwenBackbone:
-    """Backbone of the given architecture, as `random_model`."""
+    """Build the given architecture as `random_model` does."""
 
     def build() -> Any:
         config = Qwen2_5_VLConfig(**vlm_config)

@@ -16,7 +16,7 @@ from transformers.models.qwen2_5_vl.modeling_qwen2_5_vl import (
 
 
 class WindowAttention(Qwen2_5_VLVisionAttention):
-    """Attention that reads a window of all images in one call; stock code calls once for each image, too."""
+    """Attention that reads a window of all images in one call; stock code makes a call per image."""
 
     def forward(
         self,
@@ -37,7 +37,7 @@ class WindowAttention(Qwen2_5_VLVisionAttention):
         return self.proj(self._read_windows(window_lengths, queries, keys, parts[2]).flatten(1))
 
     def _read_windows(self, lengths: Sequence[int], *parts: Tensor) -> Tensor:
-        """Queries, keys and values (N, heads, size of a head) -> what was read, of the same shape."""
+        """Queries, keys and values (N, heads, size of a head) -> attention outputs of the same shape."""
         if len(set(lengths)) == 1:
             return self._read(*(part.unflatten(0, (-1, lengths[0])) for part in parts)).flatten(0, 1)
         of_images = (part.unflatten(0, (-1, sum(lengths))).split(list(lengths), dim=1) for part in parts)
@@ -45,7 +45,7 @@ class WindowAttention(Qwen2_5_VLVisionAttention):
         return torch.cat(windows, dim=1).flatten(0, 1)
 
     def _read(self, *parts: Tensor) -> Tensor:
-        """Queries, keys and values (windows, patches, heads, size of a head) -> what was read."""
+        """Queries, keys and values (windows, patches, heads, size of a head) -> attention outputs."""
         queries, keys, values = (part.transpose(1, 2) for part in parts)
         return scaled_dot_product_attention(queries, keys, values, scale=self.scaling).transpose(1, 2)
 
@@ -59,7 +59,7 @@ def read_windows_at_once(visual: nn.Module) -> None:
 def embed_patches(visual: Any, patches: Tensor, num_images: int, side: int) -> Tensor:
     """Patches of square images -> features (num_images, P / 4, H) of merged patches.
 
-    Windows and rotations are those of one image, again for each.
+    All images share the windows and rotations of one.
     """
     grid_13 = torch.tensor([[1, side, side]])
     window_index, ends = visual.get_window_index(grid_13)

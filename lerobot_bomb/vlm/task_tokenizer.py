@@ -1,4 +1,4 @@
-"""The processor step that reads a batch and its instructions, and the pipelines around it.
+"""Processor step that reads a batch and its instructions, and the pipelines around it.
 
 It turns only the task into tokens; everything else of a prompt depends on a policy's config and is put
 together inside the policy.
@@ -85,7 +85,7 @@ def _read_tasks(frames: Mapping[str, Any]) -> list[str]:
 
 
 def _as_floats(key: str, values: Any, num_rows: int) -> Any:
-    """Numbers (B, ...) as float32; images and tokens as they are.
+    """Return numbers (B, ...) as float32, images and tokens as they are.
 
     LeRobot reads a feature of one dimension as (B,), and takes that for one vector of B: (1, B).
     """
@@ -110,7 +110,7 @@ def _check_rows(values: Mapping[str, Tensor], num_tasks: int) -> None:
 class TaskTokenizerStep(TaskStep):
     """``task`` (B texts) -> ``observation.language.tokens`` (B, L) and their attention mask (B, L) bool.
 
-    ``template`` is what is written, with ``{}`` for the task. The tokenizer is the step's state, so a
+    ``template`` is the text to write, with ``{}`` for the task. The tokenizer is the step's state, so a
     checkpoint carries it whole. Rows are padded at the end. A dataset has few tasks, so their ids are kept:
     the tokenizer does not run again.
     """
@@ -160,7 +160,7 @@ class TaskTokenizerStep(TaskStep):
 
 
 def _read_by_policies(observation: Mapping[str, Any], actions: Any) -> dict[str, Tensor]:
-    """Images, state and actions, by key; not depth, which is not finite where it is missing."""
+    """Return images, state and actions by key; not depth, which is not finite where it is missing."""
     return {
         key: values
         for key, values in {**observation, ACTION: actions}.items()
@@ -176,7 +176,7 @@ def make_task_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """Rename, batch, ``task_step`` (which reads the task), device, normalise; and unnormalise, to CPU.
+    """Make the processors: rename, batch, ``task_step``, device, normalise; and unnormalise, to CPU.
 
     Raises:
         ValueError: the statistics are not finite.

@@ -40,10 +40,10 @@ NANO_WORDS = (
 
 
 def load_tokenizer(vlm_model_name: str) -> Tokenizer:
-    """Tokenizer of ``nano``, of a local folder, or of a Hub id.
+    """Load the tokenizer of ``nano``, a local folder or a Hub id.
 
     Raises:
-        OSError: no ``tokenizer.json`` can be had; the message names the ways out.
+        OSError: no ``tokenizer.json`` can be read; the message names the ways out.
     """
     if vlm_model_name == NANO:
         return nano_tokenizer()
@@ -59,14 +59,14 @@ def load_tokenizer(vlm_model_name: str) -> Tokenizer:
 
 
 def _whole(tokenizer: Tokenizer) -> Tokenizer:
-    """One that neither cuts texts nor pads them, as its file may say it should."""
+    """Turn off truncation and padding, which a tokenizer's file may ask for."""
     tokenizer.no_truncation()
     tokenizer.no_padding()
     return tokenizer
 
 
 def hub_file(vlm_model_name: str, filename: str) -> str:
-    """Path of a file of a Hub repository in the local cache, downloaded if need be."""
+    """Return the path of a Hub repository's file in the local cache, downloaded if need be."""
     if vlm_model_name.count("/") > 1 or vlm_model_name.startswith((".", "~", "/")):
         raise OSError(f"--policy.vlm_model_name={vlm_model_name}: there is no such folder")
     try:
@@ -80,12 +80,12 @@ def hub_file(vlm_model_name: str, filename: str) -> str:
 
 
 def token_ids(tokenizer: Tokenizer, text: str) -> list[int]:
-    """Tokens of a fixed part of a prompt, special ones in it included."""
+    """Return the tokens of a fixed part of a prompt, special ones included."""
     return tokenizer.encode(text, add_special_tokens=False).ids
 
 
 def single_id(tokenizer: Tokenizer, vlm_model_name: str, family: str, *texts: str) -> int:
-    """The first of these texts that is exactly one token.
+    """Return the id of the first of these texts that is exactly one token.
 
     Raises:
         ValueError: none is; the message names the family of tokenizers that have one.
@@ -100,15 +100,15 @@ def single_id(tokenizer: Tokenizer, vlm_model_name: str, family: str, *texts: st
 
 
 def tokenizer_to_tensor(tokenizer: Tokenizer) -> Tensor:
-    """The tokenizer's JSON as uint8 (bytes,)."""
+    """Return the tokenizer's JSON as uint8 (bytes,)."""
     return torch.frombuffer(bytearray(tokenizer.to_str().encode()), dtype=torch.uint8)
 
 
 def tokenizer_from_tensor(json_bytes: Tensor) -> Tokenizer:
-    """Inverse of `tokenizer_to_tensor`.
+    """Invert `tokenizer_to_tensor`.
 
     Raises:
-        ValueError: it is no tokenizer, or not whole.
+        ValueError: the bytes are no tokenizer, or not whole.
     """
     if json_bytes.dtype != torch.uint8 or json_bytes.ndim != 1:
         raise ValueError(f"a tokenizer is uint8 (bytes,), not {json_bytes.dtype} {tuple(json_bytes.shape)}")
@@ -119,7 +119,7 @@ def tokenizer_from_tensor(json_bytes: Tensor) -> Tokenizer:
 
 
 def nano_tokenizer() -> Tokenizer:
-    """Byte-level BPE as SmolVLM's, whose only merges build the words of the task language.
+    """Build a byte-level BPE like SmolVLM's, whose only merges build the words of the task language.
 
     A word is merged letter by letter from its start, so a word that is not listed becomes the longest
     listed beginning and bytes. No digit takes part in a merge: every digit is one token.

@@ -38,7 +38,7 @@ OURS = (
     lerobot_policy_spatialvla_grid,
     lerobot_policy_vla0_smol,
 )
-SHARED = "lerobot_env_mujoco"  # package of ours, by which environments draw; of no type
+SHARED = "lerobot_env_mujoco"  # our package with which environments draw; it has no type
 
 resolve_checkpoints(PREFIX, checkpoint_path)
 register(

@@ -15,5 +15,5 @@ def make_bomb_expert_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """(preprocessor, postprocessor); the action space is the environment's own."""
+    """Return (preprocessor, postprocessor); actions stay in the environment's units."""
     return make_default_pre_post_processors(config, dataset_stats)

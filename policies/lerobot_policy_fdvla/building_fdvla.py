@@ -1,4 +1,4 @@
-"""The vision-language model of an ``fdvla``, from its config or a checkpoint's, and its prompt."""
+"""Vision-language model of an ``fdvla``, from its config or a checkpoint's, and its prompt."""
 
 from collections.abc import Sequence
 
@@ -30,7 +30,7 @@ def build_model(config: FdvlaConfig) -> tuple[QwenPrompt, QwenBackbone]:
 def make_layout(
     config: FdvlaConfig, tokens: QwenPrompt, cameras: Sequence[str], tokens_per_image: int
 ) -> PromptLayout:
-    """Make the layout of prompts: images, instruction, a token whose place the state's embedding takes."""
+    """Make the layout of prompts: images, instruction, a token that the state's embedding replaces."""
     image = [tokens.image_start, *tokens_per_image * [tokens.image], tokens.image_end]
     pieces = [
         Piece(START, tokens.start),

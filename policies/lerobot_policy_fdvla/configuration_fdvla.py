@@ -47,7 +47,7 @@ SHAPES = (
     "dualmod_dim",
     "pointing",
 )
-# the same, and flags that say what the model's tokens mean
+# those, and flags that say what the model's tokens mean
 AS_TRAINED = (
     *SHAPES,
     *("image_size", "segment_attention", "reasoning_pool"),
@@ -230,7 +230,7 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
         return self.consistency == "energy_vjp" and self.used_consistency_weight > 0
 
     def sampling(self) -> dict[str, Any]:
-        """Options of `lerobot_bomb.flow.samplers.sample`."""
+        """Return the options of `lerobot_bomb.flow.samplers.sample`."""
         return {
             "sampler": self.used_sampler,
             "solver": self.solver,
@@ -242,7 +242,7 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
 
     @property
     def used_sampler(self) -> str:
-        """The sampler of the flag, or the default for the heads."""
+        """Sampler of the flag, or the default for the heads."""
         if self.sampler is not None:
             return self.sampler
         if self.use_flow_head:
@@ -251,7 +251,7 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
 
     @property
     def used_consistency_weight(self) -> float:
-        """The weight of the flag, or the default for the heads."""
+        """Weight of the flag, or the default for the heads."""
         if self.consistency_loss_weight is not None:
             return self.consistency_loss_weight
         return CONSISTENCY_LOSS_WEIGHT if self.use_flow_head and self.use_denoise_head else 0.0
@@ -259,7 +259,7 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
 
 @contextmanager
 def _policy_flags() -> Iterator[None]:
-    """Errors that begin with the name of an option, as `lerobot_bomb.flow` raises them, name the flag."""
+    """Make errors of `lerobot_bomb.flow`, which begin with the name of an option, name the flag."""
     try:
         yield
     except ValueError as error:

@@ -32,6 +32,6 @@ class Context:
 
     @classmethod
     def of(cls, tensors: Sequence[Tensor], has_feedback: bool) -> "Context":
-        """The inverse of `tensors`."""
+        """Invert `tensors`."""
         pooled, *rest = tensors
         return cls(Prefix.of(rest[has_feedback:]), pooled, rest[0] if has_feedback else None)

@@ -118,9 +118,9 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     # Training
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
-        """Losses of both heads at random times of each chunk; ``reduction="none"`` gives (B,).
+        """Return the losses of both heads at random times of each chunk; ``reduction="none"`` gives (B,).
 
-        As CogACT (arXiv 2411.19650) does, ``draws_per_chunk`` of them; `B` counts these from here on.
+        A chunk gets ``draws_per_chunk`` times, as in CogACT (arXiv 2411.19650); `B` then counts them all.
         """
         if self.training:
             begin_batch(self.config, self.generator)
@@ -167,10 +167,9 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     def chunk_loss(
         self, prompt: TokenRows, embeds_BLH: Tensor, state_BS: Tensor | None, point: PathPoint
     ) -> Tensor:
-        """(B,) losses of both heads, without their disagreement and without pointing.
+        """Return (B,) losses of both heads for embedded prompts, without their disagreement and pointing.
 
-        ``B`` may be a multiple of the prompts', which were embedded before. ``state_BS``: None without
-        pointing.
+        ``B`` may be a multiple of the number of prompts. ``state_BS``: None without pointing.
         """
         context = self._context(prompt, embeds_BLH)
         if state_BS is not None:
@@ -180,7 +179,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         return self._joint_loss(predicted, point, all_BK, reduction="none", consistency="none")[0]
 
     def _targets(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Labels | None]:
-        """Actions (B, K, D), the loss mask (B, K) over them, and what is pointed at."""
+        """Return actions (B, K, D), the loss mask (B, K) over them, and labels of pointing."""
         actions_BKD, loss_mask_BK = self._actions(batch), self._loss_mask(batch)
         if self.pointer is None:
             return actions_BKD, loss_mask_BK, None
@@ -191,9 +190,9 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     def _read_and_point(
         self, batch: dict[str, Tensor], labels: Labels | None
     ) -> tuple[Context, dict[str, Tensor], Tensor]:
-        """The observation, with the places that heads are given; losses (B,) of what is pointed at.
+        """Return the context with the places that the heads are given, and losses (B,) of pointing.
 
-        And image features (B, P, H), P of all cameras, as the language model reads them.
+        Also return image features (B, P, H), P of all cameras, as the language model reads them.
         """
         context, embeds_BLH = self._read_embeds(batch)
         features_BPH = embeds_BLH[:, self.layout.image_columns(embeds_BLH.device)]
@@ -204,7 +203,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         return context, self.pointer.losses(pointed, labels), features_BPH
 
     def _actions(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, K, D) as the heads predict them: normalised, and relative where they are."""
+        """Read actions (B, K, D) as the heads predict them: normalised, and relative if configured."""
         shape = self.config.chunk_size, self.action_dim
         actions_BKD = read_actions(batch, ACTION, self.config.type, self._device, shape).float()
         return self.to_relative(actions_BKD, batch)
@@ -226,9 +225,9 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         actions_BKD: Tensor,
         loss_mask_BK: Tensor,
     ) -> dict[str, float]:
-        """The loss's terms, and errors of the actions that A^tau and a head imply, in the data's units.
+        """Return loss terms, and errors of the actions that A^tau and a head imply, in the data's units.
 
-        Errors are known where a dataset was given, that is while training. Padded actions do not count.
+        Errors are known only with a dataset, that is in training. Padded actions do not count.
         """
         parts = {name: (term, torch.ones_like(term, dtype=torch.bool)) for name, term in terms.items()}
         limits = self.config.denoise_tau_min, self.config.clip_sample_range
@@ -240,7 +239,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     # Inference
 
     def _predict(self, batch: dict[str, Tensor], num_steps: int, noise: Tensor | None = None) -> Tensor:
-        """The first ``num_steps`` normalised actions of the chunk, which is sampled as a whole."""
+        """Return the first ``num_steps`` normalised actions of the chunk, which is sampled as a whole."""
         return self.predict_action_chunk(batch, noise)[:, :num_steps]
 
     def predict_action_chunk(
@@ -252,10 +251,10 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         prev_chunk_left_over: Tensor | None = None,
         execution_horizon: int | None = None,
     ) -> Tensor:
-        """(B, K, D) normalised actions, from ``noise`` (B, K, D) or else the next of this episode.
+        """Return normalised actions (B, K, D), from ``noise`` (B, K, D) or else the episode's next noise.
 
-        The others are of LeRobot's real-time chunking, if the config's ``rtc_config`` enables it: actions of
-        the last chunk that are not executed yet, and how many will be when this one arrives.
+        The other arguments are of LeRobot's real-time chunking, if ``rtc_config`` enables it: the last
+        chunk's actions that are not executed yet, and how many will be when this chunk arrives.
         """
         self.eval()
         # real-time chunking takes gradients, and what is captured is written over
@@ -296,7 +295,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         return 1 + num_evaluations(self.config.solver, self.config.num_inference_steps)
 
     def _left_over(self, actions_KD: Tensor, batch: dict[str, Tensor]) -> Tensor:
-        """Normalised actions (K, D) or (B, K, D) of the last chunk, as this one's heads predict them."""
+        """Return the last chunk's normalised actions, (K, D) or (B, K, D), as the heads predict them."""
         return self.to_relative(without_padding(actions_KD).to(self._device), batch)
 
     def _sample(self, noise_BKD: Tensor, step_noise: Tensor, *context: Tensor) -> tuple[Tensor]:
@@ -316,7 +315,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         return given.to(self._device)
 
     def _step_noise(self, shape: tuple[int, int, int]) -> Tensor:
-        """(B, N, K, D) for ``sde``, none of it for others."""
+        """Draw (B, N, K, D) for ``sde``, with N = 0 for others."""
         num_steps = self.config.num_inference_steps if self.config.used_sampler == "sde" else 0
         return self._draw(shape[0], (num_steps, *shape[1:]))
 
@@ -343,10 +342,10 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     # Model
 
     def _heads(self, context: Context, attended_BK: Tensor | None = None) -> Heads:
-        """Noisy actions and times -> velocity and noise (B, K, D); None for a missing head.
+        """Return the function: noisy actions and times -> velocity and noise (B, K, D), None for no head.
 
-        ``B`` may be a multiple of the observations: draws of one stand beside each other. A call is one pass
-        over the segment. Its shapes are static, and nothing in it waits for the device.
+        ``B`` may be a multiple of the number of observations; draws of one are consecutive. A call is one
+        pass over the segment. Its shapes are static, and nothing in it waits for the device.
         """
         if attended_BK is None:
             shape = len(context.pooled), self.config.chunk_size
@@ -374,7 +373,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     def _action_states(
         self, context: Context, actions_BKD: Tensor, tau_B: Tensor, attention_mask_BTT: Tensor
     ) -> Tensor:
-        """(B, K, H) of the tokens of noisy actions; draws of one observation read it and not each other."""
+        """Return states (B, K, H) of noisy actions; draws of one observation do not read each other."""
         embeds_BTH = self.segment(actions_BKD, tau_B)
         draws = SideBySide(len(embeds_BTH) // len(context.pooled))
         states = self.backbone.read_segment(
@@ -391,7 +390,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         return replace(context, feedback=self.pointer.feed_back(self._point(context, state_BS)))
 
     def _point(self, context: Context, state_BS: Tensor) -> Pointed:
-        """Predict from the first action's token, for a chunk of zeros at tau = 0."""
+        """Point, from the first action's token of a chunk of zeros at tau = 0."""
         assert self.pointer is not None
         shape, device = (len(context.pooled), self.config.chunk_size, self.action_dim), self._device
         attended_BK = torch.ones(shape[:2], dtype=torch.bool, device=device)
@@ -411,14 +410,14 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         return self._context(prompt, embeds_BLH, len(self.tokens.start)), embeds_BLH
 
     def _context(self, prompt: TokenRows, embeds_BLH: Tensor, num_shared: int = 0) -> Context:
-        """Read prompts that were embedded before with the language model."""
+        """Read embedded prompts with the language model."""
         is_image_BL = prompt.ids == self.layout.image
         prefix = self.backbone.read_prefix(embeds_BLH, is_image_BL, prompt.mask, prompt.hidden, num_shared)
         pooled_BH = masked_mean_pool(prefix.hidden, self._pooled(prompt))
         return Context(prefix, pooled_BH, feedback=None)
 
     def _pooled(self, prompt: TokenRows) -> Tensor:
-        """(B, L) bool: the tokens that are pooled; all of them without an instruction."""
+        """Return (B, L) bool, the tokens that are pooled; all of them without an instruction."""
         attention_mask_BL = prompt.attention_mask
         if self.config.reasoning_pool == "all_prefix":
             return attention_mask_BL
@@ -430,7 +429,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         return torch.where(instruction_BL.any(dim=1, keepdim=True), instruction_BL, attention_mask_BL)
 
     def embed(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
-        """(B, L, H) embeddings of a batch's prompts, image features and state in place."""
+        """Embed a batch's prompts, (B, L, H), image features and state in place."""
         generator = self.generator if self.training else None
         images = [read_image(batch, key, self.config.type, self._device) for key in self._cameras]
         images = [crop(image, self.config.crop_fraction, generator) for image in images]

@@ -41,7 +41,7 @@ class ActionSegment(nn.Module):
         self.actions = _mlp(action_dim, hidden_size)
 
     def forward(self, actions_BKD: Tensor, tau_B: Tensor) -> Tensor:
-        """(B, T, H)."""
+        """Return the segment's tokens (B, T, H)."""
         time_B1H = self.time(time_waves(tau_B))[:, None]
         actions_BKH = self.actions(actions_BKD) + self.positions + time_B1H
         begin_B1H, end_B1H = self.marks[:, None, None].expand(-1, len(tau_B), -1, -1)
@@ -49,7 +49,7 @@ class ActionSegment(nn.Module):
 
     @staticmethod
     def of_actions(states_BTH: Tensor) -> Tensor:
-        """(B, K, H) of the actions' tokens."""
+        """Return the states (B, K, H) of the actions' tokens."""
         return states_BTH[:, NUM_MARKS - 1 : -1]
 
     @staticmethod

@@ -1,6 +1,6 @@
-"""Pointing of ``fdvla`` before it acts: a place, a stone, whether that is held, read off an action token.
+"""Pointing of ``fdvla`` before it acts: place, stone and whether it is held, read from an action token.
 
-The prediction enters the action tokens ahead of both heads, as what they need: where the gripper has to go.
+The prediction enters the action tokens ahead of both heads, as the ways that the gripper has to go.
 
 Shapes: `B` batch, `P` places, `S` spots where stones lie, `H` hidden size, `D` action dims, `R` state dims.
 """
@@ -18,7 +18,7 @@ from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
 
 FEEDBACK_DIM = 128
 NUM_NUMBERS = 20
-# metres: of a way across the board, of the last of it, of a precise end
+# metres: a way across the board, its last part, a precise end
 FAR_M, NEAR_M, FINE_M = 0.1, 0.03, 0.006
 
 
@@ -28,16 +28,16 @@ class Pointed:
 
     gripper: Tensor  # (B, 3) metres
     place_logits: Tensor  # (B, P)
-    spot_logits: Tensor  # (B, S) where the stone is: of two that may be meant, the mean is none
+    spot_logits: Tensor  # (B, S) where the stone is; a mean of two possible stones would be neither
     stone: Tensor  # (B, 2) metres from the gripper, near the likeliest spot
     held_logit: Tensor  # (B,)
     features: Tensor  # (B, H)
 
 
 class Pointer(DataUnits):
-    """Heads on an action token's state, and what is fed back into the action tokens.
+    """Heads on an action token's state, and the feedback into the action tokens.
 
-    Before training what is fed back is exactly zero.
+    Before training the feedback is exactly zero.
     """
 
     places: Tensor  # (P, 2) metres
@@ -50,7 +50,7 @@ class Pointer(DataUnits):
         self.register_buffer("spots", torch.tensor(SPOTS_XY_M), persistent=False)
         self.place, self.spot = nn.Linear(hidden_size, len(places)), nn.Linear(hidden_size, len(SPOTS_XY_M))
         self.held = nn.Linear(hidden_size, 1)
-        # beside a spot, by where that is from the gripper
+        # the stone's offset from a spot, given the way from the gripper to the spot
         self.stone = nn.Sequential(
             nn.Linear(hidden_size + 4, hidden_size), nn.SiLU(), nn.Linear(hidden_size, 2)
         )
@@ -73,14 +73,14 @@ class Pointer(DataUnits):
         )
 
     def _stone(self, features_BH: Tensor, gripper_B3: Tensor, spot_B: Tensor) -> Tensor:
-        """(B, 2) metres from the gripper: the stone that lies near a spot."""
+        """Return the stone near a spot, (B, 2) metres from the gripper."""
         way_B2 = self.spots[spot_B] - gripper_B3[:, :2]
         scaled_B4 = torch.cat([way_B2 / FAR_M, torch.tanh(way_B2 / NEAR_M)], dim=1)
         beside_B2 = self.stone(torch.cat([features_BH, scaled_B4.to(features_BH.dtype)], dim=1))
         return way_B2 + NEAR_M * beside_B2.float()
 
     def feed_back(self, pointed: Pointed, place_B: Tensor | None = None) -> Tensor:
-        """(B, H) to be added to action tokens, for these places or else the likeliest.
+        """Return (B, H) to be added to action tokens, for these places or else the likeliest.
 
         No gradient reaches the prediction.
         """
@@ -97,7 +97,7 @@ class Pointer(DataUnits):
         return torch.cat([*scaled, *rest], dim=1)
 
     def pointed_at(self, pointed: Pointed) -> PointedAt:
-        """A prediction for one row -> in metres, and how likely each place is."""
+        """Return one row's prediction in metres, and how likely each place is."""
         (shares,) = pointed.place_logits.softmax(dim=1).tolist()
         return PointedAt(
             place_xy=self.places[pointed.place_logits[0].argmax()].double().cpu().numpy(),
@@ -107,7 +107,7 @@ class Pointer(DataUnits):
         )
 
     def losses(self, pointed: Pointed, labels: Labels) -> dict[str, Tensor]:
-        """(B,) each: of the place, the spot, the stone in units of `NEAR_M`, and of whether that is held."""
+        """Return losses, (B,) each, of place, spot, stone in units of `NEAR_M`, and whether it is held."""
         way_B2, spot_B = labels.stone_xy - pointed.gripper[:, :2], number_of(labels.stone_xy, self.spots)
         stone_B2 = self._stone(pointed.features, pointed.gripper, spot_B)
         errors_B2 = smooth_l1_loss(stone_B2 / NEAR_M, way_B2 / NEAR_M, reduction="none", beta=0.1)
@@ -119,14 +119,14 @@ class Pointer(DataUnits):
         }
 
     def fit(self, meta: LeRobotDatasetMetadata, config: FdvlaConfig) -> None:
-        """Take the normalisation from a dataset, and check that its labels are in range."""
+        """Take the normalisation from a dataset, and check that the config has its places."""
         config.take_places(meta)
         self.fit_units(meta, config.normalization_mapping)
 
     def draw_labels(
         self, batch: dict[str, Tensor], config: FdvlaConfig, generator: torch.Generator
     ) -> Labels:
-        """Read what a batch points at, and the places that are given; actions as LeRobot normalises them."""
+        """Read a batch's labels and draw the given places; actions are as LeRobot normalises them."""
         labels = Labels.draw(batch, self.places, config.counterfactual_share, config.type, generator)
         return replace(labels, other_actions=self.normalised(labels.other_actions))
 
@@ -137,7 +137,7 @@ def make_pointer(
     """Make the pointer; None without `pointing`. Its places are a checkpoint's or else the dataset's.
 
     Raises:
-        ValueError: there is neither.
+        ValueError: neither has places.
     """
     if not config.pointing:
         return None

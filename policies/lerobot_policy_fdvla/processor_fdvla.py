@@ -16,6 +16,6 @@ def make_fdvla_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """Rename, batch, tokenize, device, normalise; and unnormalise, to CPU."""
+    """Make the processors: rename, batch, tokenize, device, normalise; and unnormalise, to CPU."""
     tokenizer_step = TaskTokenizerStep(load_tokenizer(config.vlm_model_name))
     return make_task_processors(config, dataset_stats, tokenizer_step)

@@ -57,7 +57,7 @@ class ScoredFdvla(ScoredPromptPolicy):
         }
 
     def _noise(self, num_draws: int) -> Tensor:
-        """(J, K, D) standard normal, the same in every call."""
+        """Draw (J, K, D) standard normal, the same in every call."""
         shape = num_draws, self.policy.config.chunk_size, self.policy.action_dim
         noise_JKD = torch.randn(shape, generator=torch.Generator().manual_seed(SEED))
         return noise_JKD.to(self.policy.action_unit.device)

@@ -97,7 +97,7 @@ def make_grids(config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None
 
 
 def fit_to_data(grids: ActionGrids, config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata) -> None:
-    """Take the cells from all actions of a dataset, normalised as LeRobot will."""
+    """Fit the cells to all actions of a dataset, normalised as LeRobot will."""
     assert meta.stats is not None
     actions_ND = read_columns(meta, (ACTION,), present_episodes(meta))[ACTION].astype(np.float64)
     low_D, high_D = bounds(meta.stats[ACTION], config.normalization_mapping["ACTION"], actions_ND.shape[1])

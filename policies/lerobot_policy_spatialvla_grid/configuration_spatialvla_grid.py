@@ -33,7 +33,7 @@ DRAFTS = ("none", "repeat")
 NUM_STATE_BINS = 256
 # flags that say what shapes the weights have, beside the grids' own
 SHAPES = ("nano_config", "ego3d_no_depth_vector", "pointing", "pointing_area_m", "pointing_cell_m")
-# the same, and flags that say what the model reads and writes
+# those, and flags that say what the model reads and writes
 AS_TRAINED = ("chunk_size", "use_state", "prefix_attention", "task_template", *SHAPES)
 BARE_TASK = "{}"
 WORKSPACE_M = [list(WORKSPACE_LOW_M[:2]), list(WORKSPACE_HIGH_M[:2])]
@@ -184,7 +184,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
         ]
 
     def stone_cells(self) -> StoneCells:
-        """Return where stones may be pointed at.
+        """Return the cells in which stones may be pointed at.
 
         Raises:
             ValueError: flags give no cells.
@@ -193,11 +193,11 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
 
     @property
     def prompt_template(self) -> str:
-        """`task_template`, verbatim."""
+        """`task_template` in lower case."""
         return self.task_template.lower()
 
     def check_template_as_trained(self) -> None:
-        """Raise where a flag asks for another prompt than the checkpoint's processor writes."""
+        """Raise if a flag asks for another prompt than the checkpoint's processor writes."""
         then = (self.trained_with or {}).get("task_template", BARE_TASK)
         if self.task_template != then:
             raise ValueError(
@@ -213,7 +213,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
     def read_depth_of(self, given: Collection[str] | None) -> None:
         """Let a checkpoint that was trained without observed depth read the observations' depth.
 
-        ``given``: their keys; None if they are not known yet, so that a batch reports what is missing.
+        ``given``: the observations' keys; None if unknown yet, so that a batch reports what is missing.
         """
         if self.depth_source == "observation":
             read = {
@@ -247,8 +247,8 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
         """Return the settings with which grids are made for the dataset's actions.
 
         Raises:
-            ValueError: a flag of it is wrong, the groups do not have every action dimension once, or nothing
-                says what the dimensions are.
+            ValueError: a flag is wrong, the groups do not have every action dimension once, or nothing says
+                what the dimensions are.
         """
         groups = self._given_groups()
         if groups is None:
@@ -282,7 +282,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
         )
 
     def check_grid_as_trained(self, *, is_refitted: bool) -> None:
-        """Raise where flags ask for other grids than the checkpoint has, unless new ones are fitted."""
+        """Raise if flags ask for other grids than the checkpoint has, unless new ones are fitted."""
         if self.grid_params is None:
             return
         then = GridSettings.from_dict(self.grid_params["settings"]).flags()

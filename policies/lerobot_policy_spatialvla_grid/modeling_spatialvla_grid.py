@@ -157,7 +157,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
 
     @torch.no_grad()
     def _adapt(self, meta: LeRobotDatasetMetadata) -> None:
-        """Fit the grids to another dataset; a new cell takes its rows from its position in the old grids."""
+        """Fit the grids to another dataset; interpolate each new cell's rows from the old grids."""
         old, new = self.grids, ActionGrids(self.config.grid_settings(), self.action_dim)
         fit_to_data(new, self.config, meta)
         if new.to_dict() == old.to_dict():  # a training that is resumed
@@ -193,7 +193,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         return peft_targets(self, "language_model", (*CELL_TABLES, BOARD_READER), adapted_layers(self.config))
 
     def _validate_peft_config(self, peft_config: Any) -> None:
-        """Check that adapters hold the cells of adapted grids, which are in the adapters' config."""
+        """Check that adapters hold the cells of adapted grids, by the adapters' config."""
         super()._validate_peft_config(peft_config)
         if self._num_cells_of_base is not None:
             num_cells = self.grids.num_cells, self._num_cells_of_base
@@ -202,7 +202,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
     # Training
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
-        """Cross-entropy of the answer, over the loss mask; ``reduction="none"`` gives (B,)."""
+        """Return the answer's cross-entropy over the loss mask; ``reduction="none"`` gives (B,)."""
         if reduction not in ("mean", "none"):
             raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
         if self.training:
@@ -225,7 +225,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         return loss, means(parts | board, loss, self.config.trained_batches)
 
     def _targets(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Target]:
-        """Cells (B, T, G), the loss mask (B, T) of steps, and what is pointed at ahead of them."""
+        """Return cells (B, T, G), the loss mask (B, T) of steps, and the pointing tokens ahead of them."""
         shape = self.config.chunk_size, self.action_dim
         actions_BTD = read_actions(batch, ACTION, self.config.type, self._device, shape)
         loss_mask_BT = self._loss_mask(batch)
@@ -244,9 +244,9 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
     def _hidden(
         self, batch: dict[str, Tensor], cells_BTG: Tensor, pointed_BN: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """(B, N, H) and (B, T, G, H) teacher-forced states that predict pointing tokens and cells.
+        """Return teacher-forced states (B, N, H) and (B, T, G, H) that predict pointing tokens and cells.
 
-        And image features (B, P, H), P of all cameras.
+        Also return image features (B, P, H), P of all cameras.
         """
         if pointed_BN is None:
             pointed_BN = cells_BTG.new_empty(len(cells_BTG), 0)
@@ -259,7 +259,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
     def _hidden_after(
         self, prompt: TokenRows, embeds_BLH: Tensor, answer_BS: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return what `_hidden` returns, after a prompt that was embedded before."""
+        """Return the states of `_hidden`, for prompts that are embedded already."""
         pointed_BN, cells_BTG = self._split(answer_BS)
         first_N = [slot.start for slot in self._pointing_rows]
         pointed_BN = pointed_BN + pointed_BN.new_tensor(first_N)
@@ -285,7 +285,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         return pointing, cells.unflatten(1, (-1, len(self.grids.groups)))
 
     def log_probability(self, prompt: TokenRows, embeds_BLH: Tensor, answer_BS: Tensor) -> Tensor:
-        """(B,) of answers after prompts that were embedded before."""
+        """Return log-probabilities (B,) of answers after embedded prompts."""
         pointed_BN, cells_BTG = self._split(answer_BS)
         pointing_BNH, hidden_BTGH = self._hidden_after(prompt, embeds_BLH, answer_BS)
         score_B = self._log_probability(self._group_rows, hidden_BTGH, cells_BTG)
@@ -295,7 +295,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         return score_B + self._log_probability(self._pointing_rows, *as_step)
 
     def _log_probability(self, rows: list[slice], hidden_BTGH: Tensor, tokens_BTG: Tensor) -> Tensor:
-        """(B,) of tokens, whose rows of the table may be chosen in each of G slots."""
+        """Return log-probabilities (B,) of tokens; ``rows`` are the choices in each of G slots."""
         chosen = []
         for i, slot in enumerate(rows):
             logits_BTC = self._logits(slot, hidden_BTGH[:, :, i]).float()
@@ -305,7 +305,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
     def _losses(
         self, hidden_BTGH: Tensor, cells_BTG: Tensor, rows: list[slice] | None = None
     ) -> tuple[Tensor, Tensor]:
-        """(B, T, G) losses and the likeliest cells, group by group; ``rows``: of other tokens than cells."""
+        """Return losses and likeliest cells, (B, T, G) each; ``rows``: those of other tokens than cells."""
         losses, chosen = [], []
         slots = self._group_rows if rows is None else rows
         for slot, hidden_BTH, labels_BT in zip(
@@ -319,7 +319,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         return torch.stack(losses, dim=2), torch.stack(chosen, dim=2)
 
     def _pointing_losses(self, hidden_BNH: Tensor, tokens_BN: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, N) losses and the likeliest tokens."""
+        """Return losses and likeliest tokens, (B, N) each."""
         if self.pointer is None:
             return torch.zeros_like(tokens_BN, dtype=torch.float32), tokens_BN
         as_step = hidden_BNH[:, None], tokens_BN[:, None], self._pointing_rows
@@ -327,7 +327,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         return losses_B1N[:, 0], chosen_B1N[:, 0]
 
     def _full_logits(self, hidden_BTH: Tensor) -> Tensor:
-        """(B, T, all cells, then the vocabulary)."""
+        """Return logits (B, T, all cells, then the vocabulary)."""
         logits = [self.cell_head(hidden_BTH), self.backbone.vlm.lm_head(hidden_BTH)]
         return self.backbone.cap(torch.cat(logits, dim=-1).float())
 
@@ -338,7 +338,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         """Return which cells are right and absolute errors in the data's units, as `means` takes them.
 
         Teacher-forced: every cell is predicted from the true ones before it. Padded actions do not count.
-        Errors are known where a dataset was given, that is while training.
+        Errors are known only with a dataset, that is in training.
         """
         parts = {"token_accuracy": (chosen_BTG == cells_BTG, loss_mask_BTG)}
         errors_BTD = (self.grids.decode(chosen_BTG) - self.grids.decode(cells_BTG)).abs() * self.action_unit
@@ -347,16 +347,16 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
     # Inference
 
     def _predict(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
-        """The first ``num_steps`` actions of the chunk; the model need not choose the rest."""
+        """Return the first ``num_steps`` actions of the chunk; the model need not choose the rest."""
         return self.grids.decode(self.choose(batch, num_steps))
 
     def choose(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
-        """(B, num_steps, G) cells."""
+        """Choose cells (B, num_steps, G)."""
         return self._split(self.write(batch, num_steps))[1]
 
     @torch.no_grad()
     def write(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
-        """(B, S) answers: pointing tokens, then the cells of all steps."""
+        """Write answers (B, S): pointing tokens, then the cells of all steps."""
         self.eval()
         with self.autocast():
             prompt = self.prompt(batch)
@@ -391,7 +391,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
 
     @property
     def last_tokens(self) -> int:
-        """Cells of a prediction that is executed."""
+        """Number of a prediction's cells that are executed."""
         num_steps = self.config.temporal_ensemble_size or self.config.n_action_steps
         return num_steps * len(self.grids.groups)
 
@@ -402,7 +402,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         return self.cell_embedding(rows) * self.backbone.embed_scale
 
     def _logits(self, rows: slice, hidden: Tensor) -> Tensor:
-        """(..., H) -> (..., those rows of the table)."""
+        """(..., H) -> logits (..., those rows of the table)."""
         return self.backbone.cap(linear(hidden, self.cell_head.weight[rows]))
 
     @property
@@ -413,7 +413,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
 
     @property
     def _pointing_rows(self) -> list[slice]:
-        """N: which rows, after those of the cells, may be chosen for each token that points."""
+        """Rows, after those of the cells, that may be chosen for each of the N pointing tokens."""
         return [] if self.pointer is None else self.pointer.slots(self.grids.num_tokens)
 
     @property
@@ -431,16 +431,16 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         return {STATE: TokenRows(self.symbol_ids[symbols_BNC].flatten(1), mask_BNC.flatten(1))}
 
     def embed(self, ids_BL: Tensor, features_BPH: Tensor) -> Tensor:
-        """(B, L, H) embeddings of prompts, image features in place."""
+        """Embed prompts, (B, L, H), image features in place."""
         return self.layout.with_images(self.backbone.embed_tokens(ids_BL), features_BPH)
 
     def encode_images(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, P of all images, H) image features."""
+        """Return image features (B, P of all images, H)."""
         features = [self._encode_image(batch, key) for key in self._cameras]
         return self.backbone.project(torch.cat(features, dim=1))
 
     def _encode_image(self, batch: dict[str, Tensor], key: str) -> Tensor:
-        """Features of a camera's patches, which know where they are: (B, P, vision model's hidden size)."""
+        """Return features of a camera's patches with their positions, (B, P, vision model's hidden size)."""
         image = read_image(batch, key, self.config.type, self._device)
         windows = draw_windows(image, self.config.crop_fraction, self.generator if self.training else None)
         pixels = resized_pixels(windows.cut(image), self.backbone.image_size)

@@ -1,6 +1,6 @@
 """Pointing of ``spatialvla_grid`` before it acts: two tokens ahead of the cells, for a place and a stone.
 
-The decoder chooses actions after these tokens, so they follow what is pointed at.
+The decoder chooses actions after these tokens, so they follow the pointing.
 
 Shapes: `B` batch, `P` places, `D` action dims, `N` tokens ahead of the cells.
 """
@@ -27,7 +27,7 @@ CELL_M = 0.001, 0.05  # least and largest side: of a camera's precision, and abo
 
 @dataclass(frozen=True)
 class StoneCells:
-    """Squares of the board's plane, numbered along y, then x; the outermost ones have what is beyond."""
+    """Square cells of the board's plane, numbered along y, then x; the outermost include all beyond."""
 
     low_m: tuple[float, float]
     high_m: tuple[float, float]
@@ -57,7 +57,7 @@ class StoneCells:
         return x, y
 
     def number_of(self, xy_B2: Tensor) -> Tensor:
-        """(B,) int64."""
+        """Return the number of each point's cell, (B,) int64."""
         last_2 = xy_B2.new_tensor(self.counts) - 1
         cells_B2 = ((xy_B2 - xy_B2.new_tensor(self.low_m)) / self.cell_m).floor().clamp(min=0)
         x_B, y_B = torch.minimum(cells_B2, last_2).long().unbind(dim=1)
@@ -88,7 +88,7 @@ class Target:
 
 
 class CellPointer(nn.Module):
-    """Tokens for places and stones, and a batch's labels in them; what it holds is in the config."""
+    """Turns a batch's labels into tokens for places and stones; the config has all that it holds."""
 
     places: Tensor  # (P, 2) metres
     action_bounds: Tensor  # (2, D) the environment's actions that are -1 and 1; known while training
@@ -102,12 +102,12 @@ class CellPointer(nn.Module):
         self.num_tokens = len(places) + math.prod(stones.counts)
 
     def slots(self, first: int) -> list[slice]:
-        """Rows of the tables that may be chosen for each token; ``first``: that of the first place."""
+        """Return the rows of the tables that may be chosen for each token; ``first``: the first place's."""
         first_stone = first + len(self.places)
         return [slice(first, first_stone), slice(first_stone, first + self.num_tokens)]
 
     def pointed_at(self, tokens_N: Tensor, shares_P: Tensor) -> PointedAt:
-        """(N,) tokens that were chosen, and how likely each place was -> in metres."""
+        """(N,) chosen tokens and (P,) probabilities of places -> what is pointed at, in metres."""
         place, stone = tokens_N.tolist()
         places = [(x, y) for x, y in self.places.tolist()]
         return PointedAt(
@@ -124,7 +124,7 @@ class CellPointer(nn.Module):
     def draw(
         self, batch: dict[str, Any], config: "SpatialvlaGridConfig", generator: torch.Generator
     ) -> tuple[Labels, Target]:
-        """Draw what a batch points at, actions as LeRobot normalises them; and the tokens that are given.
+        """Draw a batch's labels, actions as LeRobot normalises them, and the tokens that are given.
 
         Counterfactual places carry no loss.
         """
@@ -139,7 +139,7 @@ def make_pointer(config: "SpatialvlaGridConfig", meta: LeRobotDatasetMetadata | 
     """Make the pointer; None without `pointing`. Its places are a checkpoint's or else the dataset's.
 
     Raises:
-        ValueError: there is neither.
+        ValueError: neither has places.
     """
     if not config.pointing:
         return None

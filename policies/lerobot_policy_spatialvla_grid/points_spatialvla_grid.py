@@ -18,7 +18,7 @@ def camera_points(
     pixels: Tensor,
     size: int,
 ) -> Tensor:
-    """(B, R, R, 3) metres of what the pixels of a lattice of R = ``size`` a side show; NaN: not known."""
+    """Return the points (B, R, R, 3), in metres, of a lattice of R = ``size`` a side; NaN: not known."""
     if config.depth_source == "none":
         return pixels.new_full((len(pixels), size, size, 3), torch.nan)
     if zoedepth is None:

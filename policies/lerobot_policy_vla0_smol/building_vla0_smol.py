@@ -1,4 +1,4 @@
-"""The vision-language model of a ``vla0_smol``, from its config or a checkpoint's, and its prompt."""
+"""Vision-language model of a ``vla0_smol``, from its config or a checkpoint's, and its prompt."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,7 +17,7 @@ from lerobot_bomb.vlm.qwen import QwenBackbone, build_qwen, load_qwen
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_vla0_smol.configuration_vla0_smol import Vla0SmolConfig
 
-# of Qwen2.5-VL, which reads any; as VLA-0 does
+# default for Qwen2.5-VL, which reads any size; VLA-0's
 QWEN_IMAGE_SIZE = 224
 
 type TextBackbone = SmolVLMBackbone | QwenBackbone

@@ -16,11 +16,11 @@ from lerobot_bomb.training.policy_flags import check_positive
 
 DRAFTS = ("none", "linear")
 MAX_BINS = 10**MAX_DIGITS
-# of brightness, contrast, saturation and hue
+# largest brightness, contrast, saturation and hue
 COLOR_JITTER_MOST = (1.0, 1.0, 1.0, 0.5)
 # flags that say which weights there are, and their shapes
 SHAPES = ("nano_config", "pointing")
-# the same, and flags that say what the model's tokens mean
+# those, and flags that say what the model's tokens mean
 AS_TRAINED = (
     *("chunk_size", "n_action_bins", "n_state_bins", "bin_mode", "number_width", "use_state", "image_size"),
     "pointing_range_m",
@@ -148,7 +148,7 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig, PointingVlaConfig):
         Of n units of a chunk a fraction below ``mask_max_fraction`` is hidden, rounded down.
 
         Raises:
-            ValueError: that is none of them.
+            ValueError: that hides none of them.
         """
         if self.mask_max_fraction == 0 or self.mask_skip_prob == 1:
             return

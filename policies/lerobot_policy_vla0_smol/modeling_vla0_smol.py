@@ -121,7 +121,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
     # Training
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
-        """Cross-entropy of the answer's tokens, over the loss mask; ``reduction="none"`` gives (B,)."""
+        """Return the answer's cross-entropy over the loss mask; ``reduction="none"`` gives (B,)."""
         if reduction not in ("mean", "none"):
             raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
         if self.training:
@@ -150,10 +150,10 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
     def _metric_parts(
         self, logits_BAV: Tensor, answer: Answer, numbers: NumberTokens, bins_BN: Tensor
     ) -> Parts:
-        """Right tokens and exact numbers, absolute errors in the data's units, as `means` takes them.
+        """Return right tokens, exact numbers and absolute errors in the data's units, as `means` takes them.
 
         Teacher-forced: every digit is predicted from the true ones before it. Hidden and padded numbers do
-        not count. Errors are known where a dataset was given, that is while training.
+        not count. Errors are known only with a dataset, that is in training.
         """
         before = self._num_pointing
         # what is pointed at is no action
@@ -196,7 +196,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         return hidden_BLH.gather(1, index_BAH)
 
     def log_probability(self, features_BPH: Tensor, prompt: TokenRows, numbers_BN: Tensor) -> Tensor:
-        """(B,) of written numbers, among those that the grammar allows, after prompts and their images."""
+        """Return log-probabilities (B,) of numbers under the grammar, after prompts and their images."""
         written = self._answer(self._to_tokens(numbers_BN, self.config.n_action_bins)).rows
         hidden_BAH = self._answer_hidden(features_BPH, prompt, written)
         logits_BAS = self.backbone.head(self.symbol_ids)(hidden_BAH)
@@ -208,14 +208,14 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         return chosen_BA1.sum(dim=(1, 2))
 
     def _targets(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """(B, N) int64 bins of what is written, actions step by step; (B, N) bool, the loss mask."""
+        """Return the bins to write, (B, N) int64, actions step by step, and the loss mask, (B, N) bool."""
         shape = self.config.chunk_size, self.action_dim
         actions_BTD = read_actions(batch, ACTION, self.config.type, self._device, shape)
         actions_BTD, loss_mask_BT = self.to_relative(actions_BTD, batch), self._loss_mask(batch)
         if self.pointer is None:
             return self._action_targets(actions_BTD, loss_mask_BT)
         config = self.config
-        # evaluation is of what is meant
+        # evaluation is on the true places
         share = config.counterfactual_share if self.training else 0.0
         labels = self.pointer.labels(batch, share, config.type, self.generator)
         other_B1D = self.to_relative(labels.other_actions[:, None], batch)
@@ -264,18 +264,18 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
     # Inference
 
     def _predict(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
-        """The first ``num_steps`` actions of the chunk, absolute; the model need not write the rest."""
+        """Return the chunk's first ``num_steps`` actions, absolute; the model need not write the rest."""
         numbers_BN = self.write(batch, num_steps)[:, self._num_pointing :]
         actions_BTD = self.action_bins.decode(numbers_BN).view(-1, num_steps, self.action_dim)
         return self.to_absolute(actions_BTD, batch).clamp(-1, 1)
 
     @torch.no_grad()
     def write(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
-        """(B, N) numbers: those of pointing, then those of the actions."""
+        """Write numbers (B, N): those of pointing, then those of the actions."""
         self.eval()
         with self.autocast():
             prompt = self.prompt(batch)
-            if not prompt.ids.is_cuda:  # prompts of other lengths would be recorded anew there
+            if not prompt.ids.is_cuda:  # there, prompts of each length would be captured anew
                 prompt = prompt.without_padding()
             embeds_BLH = self.embed(prompt.ids, self.encode_images(batch))
             num_numbers = self._num_numbers(num_steps)
@@ -325,7 +325,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         return NumberTokens(self.symbol_ids[symbols_BNC], mask_BNC, mask_BNC)
 
     def encode_images(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, P of all images, H) image features."""
+        """Return image features (B, P of all images, H)."""
         generator = self.generator if self.training else None
         images = [read_image(batch, key, self.config.type, self._device) for key in self._cameras]
         images = [crop(image, self.config.crop_fraction, generator) for image in images]
@@ -334,5 +334,5 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         return encode_images(self.backbone, images)
 
     def embed(self, ids_BL: Tensor, features_BPH: Tensor) -> Tensor:
-        """(B, L, H) embeddings of a sequence that starts with a prompt, image features in place."""
+        """Embed a sequence that starts with a prompt, (B, L, H), image features in place."""
         return self.layout.with_images(self.backbone.embed_tokens(ids_BL), features_BPH)

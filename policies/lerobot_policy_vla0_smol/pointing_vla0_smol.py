@@ -1,4 +1,4 @@
-"""Pointing of ``vla0_smol`` before its actions: where the stone is, where the place, and how far that is.
+"""Pointing of ``vla0_smol`` before its actions: where stone and place are, and the way to the place.
 
 Shapes: `B` batch, `S` state dims, `J` numbers of what is pointed at.
 """
@@ -41,29 +41,29 @@ class TextPointer(DataUnits):
     def labels(
         self, batch: dict[str, Any], other_share: float, policy_type: str, generator: torch.Generator
     ) -> MetricLabels:
-        """Read what a batch points at, and the places that are given; actions as LeRobot normalises them."""
+        """Read a batch's labels and draw the given places; actions are as LeRobot normalises them."""
         labels = MetricLabels.read(batch, other_share, policy_type, self.state_bounds.device, generator)
         return replace(labels, other_actions=self.normalised(labels.other_actions))
 
     def bins_of(self, labels: MetricLabels, state_BS: Tensor) -> Tensor:
-        """(B, J) int64 of what is given; ways that are longer than the range end with it."""
+        """Return the bins (B, J) int64 of what is given; longer ways are cut to the range."""
         way_B2 = labels.given_xy - self.gripper(state_BS)[:, :2]
         return self._bins.encode(torch.cat([labels.stone_xy, labels.given_xy, way_B2], dim=1) / self._range_m)
 
     def pointed_at(self, bins_J: Tensor) -> PointedAt:
-        """(J,) int64 bins that were written -> in metres."""
+        """(J,) int64 written bins -> what is pointed at, in metres."""
         metres_J = (self._bins.decode(bins_J) * self._range_m).double().cpu().numpy()
         return PointedAt(place_xy=metres_J[PLACE_NUMBERS], stone_xy=metres_J[STONE_NUMBERS])
 
     @staticmethod
     def loss_mask(labels: MetricLabels) -> Tensor:
-        """(B, J) bool; nothing that is seen tells of another place."""
+        """Return (B, J) bool; other places are left out, because no observation tells them."""
         loss_mask_BJ = (~labels.is_other[:, None]).repeat(1, NUM_NUMBERS)
         loss_mask_BJ[:, STONE_NUMBERS] = True
         return loss_mask_BJ
 
     def error_parts(self, errors_BJ: Tensor, counted_BJ: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
-        """Absolute errors of what the bins decode to -> the same in metres, as `means` takes them."""
+        """Return absolute errors of decoded bins in metres, as `means` takes them."""
         parts = {"stone_l1_m": STONE_NUMBERS, "place_l1_m": PLACE_NUMBERS}
         return {
             name: (errors_BJ[:, part] * self._range_m, counted_BJ[:, part]) for name, part in parts.items()
@@ -73,7 +73,7 @@ class TextPointer(DataUnits):
         """Take the normalisation of the numbers from a dataset.
 
         Raises:
-            ValueError: it has no pointing labels, or some are out of range.
+            ValueError: the dataset has no pointing labels, or some are out of range.
         """
         config.require_labels(meta)
         columns = read_columns(meta, (PLACE, STONE, OTHER_PLACES), present_episodes(meta))
@@ -88,7 +88,7 @@ class TextPointer(DataUnits):
 
 
 def make_pointer(config: Vla0SmolConfig, meta: LeRobotDatasetMetadata | None) -> TextPointer | None:
-    """Make the pointer; None where the config does not point."""
+    """Make the pointer; None without `pointing`."""
     if not config.pointing:
         return None
     pointer = TextPointer(config)

@@ -39,7 +39,7 @@ class ScoredVla0Smol(ScoredPromptPolicy):
             return self.policy.log_probability(rows["features"], self.prompt(rows), numbers_BN)
 
     def token_spans(self, rows: Rows) -> dict[str, TokenSpan]:
-        """Return the spans in one pass, from which the padding is taken out."""
+        """Return the spans in one pass, without padding."""
         index_L = rows["mask"][0].cumsum(dim=0) - 1
         spans: dict[str, TokenSpan] = {part: (index_L[each],) for part, each in self.columns(rows).items()}
         # the prompt's last token predicts the answer's first; rows of one answer have no padding

@@ -1,4 +1,4 @@
-"""The sections of a report, a file each, in the order of the page; those of other packages come last."""
+"""Sections of a report, one file each, in the order of the page; those of other packages come last."""
 
 from collections.abc import Callable
 
@@ -16,6 +16,6 @@ SECTIONS = Registry[Callable[[Report], Section]](
 
 
 def build(report: Report) -> list[Section]:
-    """Build the sections that the episodes have something for."""
+    """Build the sections, without those that have neither tables nor lines."""
     sections = [section(report) for section in SECTIONS.values()]
     return [section for section in sections if section.tables or section.lines]

@@ -11,12 +11,12 @@ NOTE = f"A column for each level of the axis; 0: unperturbed. With {INTERVALS}."
 
 
 def section(report: Report) -> Section:
-    """A table for each group in which an axis was on alone."""
+    """Write the section: a table for each group in which an axis was on alone."""
     return Section("Axis by level", [table for group in report.groups if (table := axes(group))])
 
 
 def axes(group: Group) -> Table | None:
-    """Success by axis and level, where one axis was on; None: nowhere. Drawn levels count at their own."""
+    """Write the table of success by axis and level, of records with one axis on; None without any."""
     cells: dict[tuple[str, int], list[Record]] = {}
     for record in group.records:
         if len(record.levels) == 1:

@@ -1,4 +1,4 @@
-"""Section `board`: where on the board stones were asked for, and where they lie."""
+"""Section `board`: where on the board stones should go, and where they lie."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -16,7 +16,7 @@ def section(report: Report) -> Section:
 
 
 def boards(group: Group) -> Iterable[Table]:
-    """Success by intersection, and where stones were put down; of episodes with one target."""
+    """Yield tables of success by intersection, and of misplaced stones, for episodes with one target."""
     records = [each for each in group.records if isinstance(each, EpisodeResult)]
     targets = [each.target for each in records if each.target is not None]
     if not targets:

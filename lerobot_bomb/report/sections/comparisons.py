@@ -17,7 +17,7 @@ NOTE = (
 
 
 def section(report: Report) -> Section:
-    """A table for each pair of policies."""
+    """Write the section: a table for each pair of policies."""
     return Section("Two policies on the same episodes", list(comparisons(report.groups)))
 
 

@@ -10,7 +10,7 @@ TITLE = "Success by condition"
 
 
 def section(report: Report) -> Section:
-    """A table for each group."""
+    """Write the section: a table for each group."""
     return Section(TITLE, [conditions(group) for group in report.groups])
 
 

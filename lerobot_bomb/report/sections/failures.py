@@ -10,7 +10,7 @@ from lerobot_bomb.results.groups import Group, by_condition
 
 
 def section(report: Report) -> Section:
-    """A table for each group."""
+    """Write the section: a table for each group."""
     return Section("Why episodes failed", [failures(group) for group in report.groups])
 
 

@@ -1,4 +1,4 @@
-"""Section `published`: other people's figures on such tasks and models; none was measured here."""
+"""Section `published`: other people's figures on these tasks and models; none was measured here."""
 
 from dataclasses import dataclass
 

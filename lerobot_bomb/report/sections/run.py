@@ -10,7 +10,7 @@ from lerobot_bomb.results.record import Record
 
 
 def section(report: Report) -> Section:
-    """Lines of each group."""
+    """Write the section: lines of each group."""
     lines = [line for group in report.groups for line in (group.name, *commands(group))]
     return Section("What was run", [], lines)
 
@@ -34,7 +34,7 @@ def _policy_flag(record: Record) -> str:
 
 
 def _as_evaluated(record: Record) -> list[str]:
-    """Device and batch, which outcomes may depend on, as far as the record says."""
+    """Return flags of device and batch, on which outcomes may depend, as far as the record says."""
     device = "" if record.inference is None else record.inference.device
     batch_size = None if record.policy is None else record.policy.batch_size
     flags = ["--policy.device=cpu"] if device.startswith("cpu") else []

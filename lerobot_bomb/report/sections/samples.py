@@ -12,7 +12,7 @@ NOTE = (
 
 
 def section(report: Report) -> Section:
-    """A table for each group that failed."""
+    """Write the section: a table for each group with failures."""
     by_group: dict[str, list[Sample]] = {}
     for sample in report.samples:
         by_group.setdefault(sample.group, []).append(sample)

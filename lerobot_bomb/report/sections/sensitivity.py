@@ -10,16 +10,16 @@ from lerobot_bomb.results.record import Record
 
 
 def section(report: Report) -> Section:
-    """A table for each group that has several levels of an axis."""
+    """Write the section: a table for each group that has several levels of an axis."""
     tables = [table for group in report.groups if (table := sensitivity(group))]
     return Section("Sensitivity to an axis", tables)
 
 
 def sensitivity(group: Group) -> Table | None:
-    """Axes in the order of their effect; None: no axis was on alone at several levels, and none was drawn.
+    """Write a table of axes by their effect; None if no axis was on alone at several levels, or drawn.
 
-    How much a level costs where the axis was on alone; of the variance of success where the levels of several
-    axes were drawn, what each explains.
+    Columns: the cost of a level where the axis was on alone; where levels of several axes were drawn, the
+    share of the variance of success that each explains.
     """
     slopes, shares = _slopes(group), _shares(group)
     if not slopes and not shares:

@@ -53,7 +53,7 @@ def _peers(group: Group, groups: list[Group]) -> list[Group]:
 
 
 def _shared(group: Group, peers: list[Group]) -> list[Record]:
-    """Return the perturbed records of the episodes that the peers with such records have, too."""
+    """Return the group's perturbed records whose episodes all peers with perturbed records have too."""
     records = group.perturbed
     for peer in peers:
         episodes = {each.spec for each in peer.perturbed}
@@ -62,7 +62,7 @@ def _shared(group: Group, peers: list[Group]) -> list[Record]:
 
 
 def _worst(records: list[Record]) -> list[Cell]:
-    """Return the condition with the lowest rate, and that rate; all of them where several have it."""
+    """Return the condition with the lowest rate, and that rate; all such conditions if several tie."""
     by = by_condition(records)
     rates = {condition: rate_of(condition_records).share for condition, condition_records in by.items()}
     worst = [condition for condition, share in rates.items() if share == min(rates.values())]
@@ -92,7 +92,7 @@ def _other_nominal(groups: list[Group]) -> Iterator[str]:
 
 
 def _measures(group: Group) -> list[tuple[Measure, str]]:
-    """Return the measures that the group's episodes have a value of, with their values."""
+    """Return the measures that have a value for the group's episodes, with that value."""
     records = group.nominal or group.records
     values = [(measure, measure.value(records)) for measure in group.record_type.measures]
     return [(measure, value) for measure, value in values if value != NO_VALUE]
