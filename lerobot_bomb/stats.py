@@ -93,13 +93,18 @@ class Rate:
         clusters = f", {self.num_clusters} clusters by seed" if self.num_clusters < self.n else ""
         return f"95 % Wilson interval{clusters}"
 
-    def __str__(self) -> str:
-        """Format as '48/50 = 96.0 % [86.5, 98.9]'."""
+    @property
+    def percent(self) -> str:
+        """Text '96.0 % [86.5, 98.9]'."""
         bounds = ""
         if self.interval is not None:
             low, high = self.interval
             bounds = f" [{100 * low:.1f}, {100 * high:.1f}]"
-        return f"{self.successes}/{self.n} = {100 * self.share:.1f} %{bounds}"
+        return f"{100 * self.share:.1f} %{bounds}"
+
+    def __str__(self) -> str:
+        """Format as '48/50 = 96.0 % [86.5, 98.9]'."""
+        return f"{self.successes}/{self.n} = {self.percent}"
 
 
 def format_rate(successes: int, n: int) -> str:

@@ -1,6 +1,8 @@
 """Tables of text."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+
+MAX_CHARACTERS = 41  # of a name in a table
 
 
 def printable(text: str) -> str:
@@ -8,15 +10,23 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
+def shortened(text: str) -> str:
+    """Cut the middle of a text of more than `MAX_CHARACTERS`."""
+    if len(text) <= MAX_CHARACTERS:
+        return text
+    half = (MAX_CHARACTERS - 3) // 2
+    return f"{text[:half]}...{text[-half:]}"
+
+
 def print_lines(*lines: str) -> None:
     """Print each text on one line, whatever is in it."""
     print(*map(printable, lines), sep="\n")
 
 
-def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows of text, the first column to the left, the others to the right."""
+def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], left: Collection[str] = ()) -> None:
+    """Print rows of text, the first column and those named in `left` to the left, the others to the right."""
+    aligned = [str.ljust if name in (header[0], *left) else str.rjust for name in header]
     header, rows = [*map(printable, header)], [[*map(printable, row)] for row in rows]
-    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
-    for name, *cells in [header, *rows]:
-        padded = [cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True)]
-        print("  ".join([name.ljust(widths[0]), *padded]).rstrip())
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    for row in [header, *rows]:
+        print("  ".join(map(lambda align, *cell: align(*cell), aligned, row, widths)).rstrip())

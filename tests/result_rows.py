@@ -76,7 +76,7 @@ def old_row(seed: int, **other: Any) -> str:
 
 
 def printed(path: Path, text: str, capsys: pytest.CaptureFixture[str]) -> str:
-    """Return what `lerobot-bomb results` says of a file."""
+    """Return what `lerobot-bomb results --verbose` says of a file."""
     path.write_text(text)
-    assert main(["results", str(path)]) == 0
+    assert main(["results", str(path), "--verbose"]) == 0
     return capsys.readouterr().out

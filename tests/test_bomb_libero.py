@@ -147,7 +147,7 @@ def test_results_pool_tasks_and_pair_conditions(tmp_path: Path, capsys: pytest.C
     rows = [line(seed, "none", True, task) for seed in range(4) for task in (0, 2)]
     rows += [line(seed, "light:3", seed > 0, task) for seed in range(4) for task in (0, 2)]
     path.write_text("\n".join(rows))
-    assert main(["results", "--strict", str(path)]) == 0
+    assert main(["results", "--strict", "--verbose", str(path)]) == 0
     text = capsys.readouterr().out
     assert "libero_spatial tasks 0, 2" in text and "robosuite" in text
     assert "success          6/8" in text and "unfinished 2" in text and "8 pairs, 2 lost, 0 won" in text

@@ -253,7 +253,7 @@ def test_results_are_a_line_per_episode_that_the_command_summarises(
     assert [row["levels"] for row in rows] == [{}, {}, {"goal": 3}, {"goal": 3}]
     assert rows[0]["goal_pose"] == [256, 256, np.pi / 4] != rows[2]["goal_pose"]
     assert rows[0]["simulator_versions"]["gym-pusht"]
-    assert main(["results", "--strict", str(path)]) == 0
+    assert main(["results", "--strict", "--verbose", str(path)]) == 0
     out = capsys.readouterr().out
     nominal, perturbed = (np.array([row["max_coverage"] for row in rows[i : i + 2]]) for i in (0, 2))
     assert f"max coverage     {nominal.mean():.3f} [" in out

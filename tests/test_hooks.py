@@ -37,7 +37,7 @@ ON_FIRST_USE = {
     "the filters of lerobot.utils.import_utils' logger",
 }
 WITH_OUR_POLICY = "lerobot.scripts.lerobot_eval.eval_policy_all"
-WITH_OUR_ENVS = {f"lerobot.scripts.lerobot_eval.{name}" for name in ("eval_policy", "rollout")}
+WITH_OUR_ENVS = {f"lerobot.scripts.lerobot_eval.{name}" for name in ("eval_policy", "rollout", "close_envs")}
 PUBLISHING = {f"lerobot.{name}.publish_trained_model" for name in MODULES}
 
 PROGRAM = '''

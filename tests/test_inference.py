@@ -278,7 +278,7 @@ def test_lines_of_earlier_releases_are_read_and_show_nothing_of_it(
     old = {name: value for name, value in values(0).items() if name not in ("inference", *SMOOTH)}
     path = tmp_path / "old.jsonl"
     path.write_text(json.dumps(old) + "\n")
-    assert main(["results", str(path)]) == 0
+    assert main(["results", str(path), "--verbose"]) == 0
     out = capsys.readouterr().out
     assert "latency" not in out and "smoothness" not in out and "lack" not in out
 
@@ -289,7 +289,7 @@ def test_results_shows_latency_and_smoothness_where_they_are(
     rows = [values(seed, inference=told(), action_j2=0.5, action_j3=1.0 + seed) for seed in range(3)]
     path = tmp_path / "r.jsonl"
     path.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    assert main(["results", str(path)]) == 0
+    assert main(["results", str(path), "--verbose"]) == 0
     out = capsys.readouterr().out
     assert "latency          500 ms, p95 500 ms (of a query, median over episodes; cpu)" in out
     assert "smoothness       J2 0.5, J3 2 [" in out

@@ -89,7 +89,7 @@ def test_a_row_that_its_batch_does_not_have_is_damage() -> None:
 
 def test_half_a_surrogate_pair_damages_its_line_only(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     half = row(1).replace("Put it there.", "Put it \\ud800.")
-    assert main(["results", str(written(path, row(0) + half + row(2)))]) == 0
+    assert main(["results", str(written(path, row(0) + half + row(2))), "--verbose"]) == 0
     printed_now = capsys.readouterr()
     assert "damaged records, which are not counted: 1" in printed_now.out and "2 episodes" in printed_now.out
     assert f"{path}:2: not an episode result: text with half a surrogate pair, '\\ud800'" in printed_now.err

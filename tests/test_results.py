@@ -111,7 +111,7 @@ def test_a_damaged_line_is_named_and_the_others_count(
     message: str, path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path.write_text(row(0) + json.dumps(values(1) | DAMAGED[message]) + "\n" + row(2))
-    assert main(["results", str(path)]) == 0
+    assert main(["results", str(path), "--verbose"]) == 0
     out, error = capsys.readouterr()
     assert f"{path}:2: not an episode result: " in error
     assert message in error
@@ -131,7 +131,7 @@ def test_a_line_that_is_no_result_does_not_take_the_others_along(
     line: bytes, path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path.write_bytes(row(0).encode() + line + b"\n\n" + row(3).encode().strip())
-    assert main(["results", str(path)]) == 0
+    assert main(["results", str(path), "--verbose"]) == 0
     out, error = capsys.readouterr()
     assert f"{path}:2: not an episode result" in error
     assert error.count("\n") == 1

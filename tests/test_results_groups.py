@@ -126,20 +126,6 @@ def test_two_policies_are_two_groups_with_pairs_of_their_own(
     assert "count no more" not in output
 
 
-def test_of_several_groups_a_line_for_each_group_and_condition_comes_first(
-    path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    conditions = [row(0), row(1, "dropped"), row(0, spec={"perturbations": "camera:3"})]
-    output = printed(path, "".join([*conditions, row(0, policy=FDVLA)]), capsys)
-    assert output.split("\n\n")[1].splitlines() == [
-        "policy, suite           perturbations  success, 95 % Wilson interval by seed",
-        "act outputs/act, place           none               1/2 = 50.0 % [9.5, 90.5]",
-        "act outputs/act, place       camera:3            1/1 = 100.0 % [20.7, 100.0]",
-        "fdvla me/fdvla, place            none            1/1 = 100.0 % [20.7, 100.0]",
-    ]
-    assert "policy, suite" not in printed(path, "".join(conditions), capsys)
-
-
 def test_one_target_and_all_targets_are_not_six_episodes(
     path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

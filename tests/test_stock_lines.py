@@ -91,7 +91,7 @@ def test_results_compare_and_report_read_the_lines(
         row["policy"] |= {"path": "outputs/other", "weights_sha256": "0" * 64}
         row |= {"is_success": True, "failure": None, "max_reward": 1.0}
     second.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    assert main(["results", str(first)]) == 0
+    assert main(["results", str(first), "--verbose"]) == 0
     printed = capsys.readouterr().out
     assert "pusht tasks 0" in printed and "success          0/4 = 0.0 %" in printed
     assert "max reward" in printed and "failed 4" in printed

@@ -96,6 +96,7 @@ class EvaluatedEnv(_EnvConfig):
                     last_query=last_query,
                     on_first_reset=on_first_reset(spec),
                     num_tasks=sum(map(len, groups.values())),
+                    results_path=self.results_path,
                 )
                 for task_id, spec in specs.items()
             }

@@ -55,6 +55,27 @@ def checkpoint_flag(text: str) -> Path:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
+def add_names_flag(parser: argparse.ArgumentParser) -> None:
+    """Declare the short names of policies."""
+    names = "short names: a policy's type, path or bomb:NAME, and its name (default: the shortest)"
+    parser.add_argument("--names", type=_names, metavar="A=NAME,B=NAME", default={}, help=names)
+
+
+def _names(text: str) -> dict[str, str]:
+    """Read 'A=NAME,B=NAME'.
+
+    Raises:
+        argparse.ArgumentTypeError: a part has no name, or two have the same one.
+    """
+    parts = [part.rpartition("=") for part in text.split(",")]
+    names = {policy: name for policy, _, name in parts if policy and name}
+    if len(names) < len(parts) or len(set(names.values())) < len(names):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} must be POLICY=NAME, several joined by commas, each name once"
+        )
+    return names
+
+
 def add_checkpoint_arguments(parser: argparse.ArgumentParser, help: str, required: bool = False) -> None:
     """Declare which checkpoint acts, and on which device."""
     add = parser.add_argument

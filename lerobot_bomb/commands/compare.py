@@ -3,9 +3,10 @@
 import argparse
 from collections.abc import Sequence
 
-from lerobot_bomb.checkpoints.shipped import checkpoint_path
-from lerobot_bomb.commands.arguments import ANSWER_IS_NO, parse_conditions, path_flag
-from lerobot_bomb.commands.results_files import read_undamaged
+from lerobot_bomb.commands.arguments import ANSWER_IS_NO, add_names_flag, parse_conditions, path_flag
+from lerobot_bomb.commands.results_files import check_outputs, names_of, policy_keys, read_undamaged
+from lerobot_bomb.files import written_whole
+from lerobot_bomb.report.latex import comparison_table
 from lerobot_bomb.results.comparison import compare
 from lerobot_bomb.results.groups import policy_key
 from lerobot_bomb.results.record import Record
@@ -18,6 +19,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     two = "without B: two of A's policies (default: the two that it has)"
     add("a", type=path_flag, metavar="A", help="file of --env.results_path")
     add("b", type=path_flag, metavar="B", nargs="?", help="results file of another policy, on the same seeds")
+    output = "also write the comparison as a LaTeX table to this file, .tex"
+    add("--output", type=path_flag, metavar="FILE.tex", help=output)
+    add_names_flag(parser)
     add("--policies", type=parse_conditions, default=(), metavar="A,B", help=two)
     unless = (
         f"exit code {ANSWER_IS_NO} unless, under every condition and with 95 %% confidence, B's success is"
@@ -53,35 +57,29 @@ def _two_policies(args: argparse.Namespace) -> tuple[list[Record], list[Record]]
 
 
 def _by_policy(records: list[Record], names: Sequence[str]) -> list[list[Record]]:
-    """Split records by policy name, in order of first appearance.
-
-    A name is a policy's type, its path, `bomb:NAME`, or any part of its description in `results`.
-
-    Raises:
-        ValueError: a name fits no policy, or several.
-    """
+    """Split records by policy: those that are named, or all in order of first appearance."""
     by_key: dict[str, list[Record]] = {}
     for record in records:
         by_key.setdefault(policy_key(record), []).append(record)
-    described = {key: policy_records[0].describe_policy() for key, policy_records in by_key.items()}
-    if not names:
-        return list(by_key.values())
-    chosen = []
-    for name in names:
-        keys = [key for key, text in described.items() if name in text.split()] or [
-            key for key, text in described.items() if checkpoint_path(name) in text
-        ]
-        if len(keys) != 1:
-            texts = "; ".join(described.values())
-            raise ValueError(f"--policies: {name} must name one policy of the file, not {len(keys)}: {texts}")
-        chosen.append(by_key[keys[0]])
-    return chosen
+    return [by_key[key] for key in (policy_keys("--policies", names, records) if names else by_key)]
+
+
+def _write(args: argparse.Namespace, text: str) -> None:
+    check_outputs([path for path in (args.a, args.b) if path is not None], [args.output])
+    with written_whole(args.output) as (unfinished,):
+        unfinished.write_text(text)
+    print(args.output)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print both rates and their difference, by condition; check the required difference."""
-    comparisons = compare(*_two_policies(args))
+    if args.output is not None and args.output.suffix != ".tex":
+        raise ValueError(f"--output={args.output} must be a file of LaTeX, .tex")
+    policies = _two_policies(args)
+    comparisons = compare(*policies, names_of(args.names, [*policies[0], *policies[1]]))
     print_lines(*comparisons.lines())
+    if args.output is not None:
+        _write(args, comparison_table(comparisons))
     low = 100 * comparisons.lowest
     verdicts = []
     if (bar := args.min_difference) is not None:

@@ -3,11 +3,11 @@
 import argparse
 from pathlib import Path
 
-from lerobot_bomb.commands.arguments import path_flag
-from lerobot_bomb.commands.results_files import check_outputs, read_undamaged
+from lerobot_bomb.commands.arguments import add_names_flag, path_flag
+from lerobot_bomb.commands.results_files import check_outputs, names_of, read_undamaged
 from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.files import file_names, written_whole
-from lerobot_bomb.report.latex import latex_table
+from lerobot_bomb.report.latex import latex_tables
 from lerobot_bomb.results.groups import groups_of, policies_of
 
 LATEX, MODEL_INDEX, EVAL_RESULTS = "table.tex", "model-index.yaml", ".eval_results/lerobot_bomb.yaml"
@@ -18,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path")
     add("--output", type=path_flag, default=Path("outputs/export"), help="folder (default: outputs/export)")
+    add_names_flag(parser)
     add(
         "--benchmark_id",
         type=_hub_id,
@@ -35,12 +36,13 @@ def _hub_id(text: str) -> str:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write a LaTeX table and, for each policy, the files of its Hub repository; print the paths."""
+    """Write LaTeX tables and, for each policy, the files of its Hub repository; print the paths."""
     # huggingface_hub takes a second
     from lerobot_bomb.hub.evaluations import check_one_rate_each, eval_results_yaml, model_index_yaml
 
-    groups = groups_of([record for path in args.paths for record in read_undamaged(path).records])
-    contents = {args.output / LATEX: latex_table(groups)}
+    records = [record for path in args.paths for record in read_undamaged(path).records]
+    groups = groups_of(records, names_of(args.names, records))
+    contents = {args.output / LATEX: latex_tables(groups)}
     policies = policies_of(groups)
     _, *names = file_names([LATEX, *(each.short_name for each in policies)])
     for name, policy in zip(names, policies, strict=True):

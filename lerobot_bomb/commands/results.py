@@ -1,43 +1,125 @@
-"""``lerobot-bomb results``: summary of the files of ``--env.results_path``."""
+"""``lerobot-bomb results``: the files of ``--env.results_path`` as one table, or their failures."""
 
 import argparse
+import shlex
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 from lerobot_bomb.commands.arguments import path_flag
-from lerobot_bomb.commands.results_files import read_undamaged
-from lerobot_bomb.results.groups import Group, by_condition, differing, groups_of, rate_of
-from lerobot_bomb.results.summary import pair_lines, summarise
-from lerobot_bomb.tables import print_lines, print_table
+from lerobot_bomb.commands.next_steps import print_next
+from lerobot_bomb.commands.results_failures import print_failures
+from lerobot_bomb.commands.results_files import ResultsFile, read_undamaged
+from lerobot_bomb.commands.table import PROGRAM
+from lerobot_bomb.results.comparison import can_compare
+from lerobot_bomb.results.groups import POLICY, Group, by_condition, differing, groups_of
+from lerobot_bomb.results.overview import differing_otherwise, rows_of, suite_of
+from lerobot_bomb.results.summary import describe_unpaired, pair_lines, summarise
+from lerobot_bomb.tables import print_lines, print_table, shortened
+
+LEGEND = (
+    "success: with 95 % Wilson interval, clustered by seed; change: points, with 95 % interval, from the",
+    "same episodes unperturbed; p: exact McNemar test, to be trusted where interval and p disagree",
+)
+WORDS = ("policy", "suite", "condition")  # columns at the left
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Groups of the records of a file."""
+
+    path: Path
+    file: ResultsFile
+    groups: list[Group]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument(
-        "paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path"
+    add = parser.add_argument
+    add("paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path")
+    add("--strict", action="store_true", help="refuse files with damaged records")
+    shown = parser.add_mutually_exclusive_group()
+    shown.add_argument(
+        "--failures", action="store_true", help="list the failed episodes, each with its replay command"
     )
-    parser.add_argument("--strict", action="store_true", help="refuse files with damaged records")
+    verbose = "also print what was run, measures, failure classes, latency and smoothness of every condition"
+    shown.add_argument("--verbose", action="store_true", help=verbose)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print rates by condition for each file, and the changes under perturbations, in pairs."""
-    for path in args.paths:
-        file = read_undamaged(path)
+    """Print rates by condition and the paired changes under perturbations, or the failures."""
+    files = {path: read_undamaged(path) for path in args.paths}
+    for path, file in files.items():
         if args.strict and file.num_damaged:
             raise ValueError(f"{path}: damaged records, which --strict refuses: {file.num_damaged}")
-        _print_file(path, groups_of(file.records), file.num_damaged)
+    names = _policy_names(files.values())
+    told = [Groups(path, file, groups_of(file.records, names)) for path, file in files.items()]
+    if args.failures:
+        print_failures({each.path: (each.file.numbered, each.groups) for each in told})
+        return 0
+    _print_rates(told)
+    print()
+    print_lines(*LEGEND, *_notes(told))
+    if args.verbose:
+        for each in told:
+            print()
+            _print_details(each)
+    print_next(_next_steps(told))
     return 0
 
 
-def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
-    if num_damaged:
-        print(f"{path}: damaged records, which are not counted: {num_damaged}")
-    if len(groups) > 1:
+def _policy_names(files: Iterable[ResultsFile]) -> dict[str, str]:
+    """Return {key of a policy: its name among those of all files}."""
+    records = [record for file in files for record in file.records]
+    return {group.settings[POLICY]: group.policy for group in groups_of(records)}
+
+
+def _print_rates(told: list[Groups]) -> None:
+    """Print a line for each group and condition."""
+    several = len(told) > 1
+    apart = [*{name: None for each in told for name in differing_otherwise(each.groups)}]
+    rows = [
+        [
+            *([str(each.path)] if several else []),
+            *(shortened(group.policy), suite_of(group), *(_setting(group, name) for name in apart)),
+            *row.texts(),
+        ]
+        for each in told
+        for group in each.groups
+        for row in rows_of(group)
+    ]
+    header = [*(["file"] if several else []), "policy", "suite", *apart, "condition"]
+    print_table([*header, "success", "change", "p (Holm)", "n"], rows, left=(*WORDS, *apart))
+
+
+def _setting(group: Group, name: str) -> str:
+    if name == "tasks":
+        return group.record_type.describe_tasks(group.records)
+    return group.settings.get(name, "")
+
+
+def _notes(told: list[Groups]) -> Iterator[str]:
+    """Yield what is damaged, not compared, or kept apart."""
+    for each in told:
+        if each.file.num_damaged:
+            yield f"{each.path}: damaged records, which are not counted: {each.file.num_damaged}"
+        if apart := differing_otherwise(each.groups):
+            yield f"{each.path}: episodes that differ in {', '.join(apart)} are neither pooled nor paired"
+        for group in each.groups:
+            if unpaired := describe_unpaired(group, each.groups):
+                yield f"{each.path}: {group.name}: {unpaired}"
+
+
+def _print_details(told: Groups) -> None:
+    """Print each group's heading, and the measures under each condition."""
+    path = told.path
+    if len(told.groups) > 1:
         print(
-            f"{path}: {len(groups)} groups of episodes, neither pooled nor paired with each other; they "
-            f"differ in {', '.join(differing(groups))}"
+            f"{path}: {len(told.groups)} groups of episodes, neither pooled nor paired with each other; they "
+            f"differ in {', '.join(differing(told.groups))}"
         )
-        _print_rates(groups)
-    for group in groups:
+    for group in told.groups:
         print_lines(*(f"{path}: {line}" for line in group.lines()))
         if group.missing_fields:
             version = group.records[0].protocol_version
@@ -50,18 +132,20 @@ def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
             label = f" (perturbations={condition})" if len(conditions) > 1 else ""
             print(f"{path}{label}: {len(records)} episode{'s' * (len(records) != 1)}")
             print_lines(*(f"  {line}" for line in summarise(records).lines()))
-        against = pair_lines(group, groups)
-        if against:
+        if against := pair_lines(group):
             print(f"{path}: against the same episodes unperturbed", *against, sep="\n")
 
 
-def _print_rates(groups: list[Group]) -> None:
-    """Print a line for each group and condition, before all details."""
-    cells = [
-        [group.name, condition, str(rate_of(records))]
-        for group in groups
-        for condition, records in by_condition(group.records).items()
-    ]
-    print()
-    print_table(["policy, suite", "perturbations", "success, 95 % Wilson interval by seed"], cells)
-    print()
+def _next_steps(told: list[Groups]) -> Mapping[str, str]:
+    paths = shlex.join(str(each.path) for each in told)
+    groups = [group for each in told for group in each.groups]
+    steps: dict[str, str] = {}
+    if number := sum(not record.is_success for group in groups for record in group.records):
+        purpose = f"{number} failure{'s' * (number > 1)}, each with the command that replays it"
+        steps[f"{PROGRAM} results {paths} --failures"] = purpose
+    pairs = [(a, b) for a, b in combinations(groups, 2) if can_compare(a, b)]
+    policies = {group.settings[POLICY] for group in groups}
+    if len(policies) == 2 and len(told) <= 2 and any(a.policy != b.policy for a, b in pairs):
+        steps[f"{PROGRAM} compare {paths}"] = "both policies on the same episodes"
+    steps[f"{PROGRAM} report {paths}"] = "figures, failures and settings as one page"
+    return steps

@@ -1,10 +1,13 @@
 """Files of results that a command is given."""
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_bomb.checkpoints.shipped import checkpoint_path
+from lerobot_bomb.results.groups import policy_key
+from lerobot_bomb.results.names import policy_names
 from lerobot_bomb.results.played import describe_missing_episodes
 from lerobot_bomb.results.reading import check_any, read_records
 from lerobot_bomb.results.record import Record, describe_numbers
@@ -88,3 +91,38 @@ def read_undamaged(path: Path) -> ResultsFile:
     if missing:
         print(missing, file=sys.stderr)
     return ResultsFile(numbered, len(damages), missing)
+
+
+def policy_keys(flag: str, names: Sequence[str], records: Sequence[Record]) -> list[str]:
+    """Return the key of each named policy.
+
+    A name is the one in `results`, a policy's type, its path, `bomb:NAME`, or any part of its description.
+
+    Raises:
+        ValueError: a name fits no policy, or several.
+    """
+    first = {policy_key(each): each for each in reversed(records)}
+    first = dict(reversed(first.items()))
+    described = {key: record.describe_policy() for key, record in first.items()}
+    short = dict(zip(first, policy_names([each.policy for each in first.values()]), strict=True))
+    found = []
+    for name in names:
+        keys = (
+            [key for key, text in short.items() if name == text]
+            or [key for key, text in described.items() if name in text.split()]
+            or [key for key, text in described.items() if checkpoint_path(name) in text]
+        )
+        if len(keys) != 1:
+            texts = "; ".join(described.values())
+            raise ValueError(f"{flag}: {name} must name one policy of the file, not {len(keys)}: {texts}")
+        found.append(keys[0])
+    return found
+
+
+def names_of(names: Mapping[str, str], records: Sequence[Record]) -> dict[str, str]:
+    """Return {key of a policy: its name} of the flag --names.
+
+    Raises:
+        ValueError: see `policy_keys`.
+    """
+    return dict(zip(policy_keys("--names", list(names), records), names.values(), strict=True))

@@ -1,6 +1,7 @@
 """``lerobot-bomb sweep``: policies x tasks x conditions, on processes or a cluster; resumes after a kill."""
 
 import argparse
+import shlex
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,13 +18,15 @@ from lerobot_bomb.commands.cluster_jobs import (
     submitted,
     write_job_array,
 )
+from lerobot_bomb.commands.next_steps import print_next
+from lerobot_bomb.commands.table import PROGRAM
 from lerobot_bomb.environments import ENVIRONMENTS, env_type
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.local import PYTHON, progress, run_part
 from lerobot_bomb.sweep.manifest import NAME, Job, Manifest, flag_value, plan, policy_flag
-from lerobot_bomb.sweep.store import Store
+from lerobot_bomb.sweep.store import RESULTS, Store
 from lerobot_bomb.tables import print_lines
 
 MAX_BATCH = 10
@@ -95,6 +98,9 @@ def _run_jobs(args: argparse.Namespace, store: Store, jobs: list[Job]) -> int:
         raise
     store.merge()
     print_lines(*store.lines())
+    if any(map(store.is_finished, jobs)):
+        path = store.folder / RESULTS
+        print_next({shlex.join([PROGRAM, "results", str(path)]): "rates, changes and failures"})
     is_whole = all(store.is_finished(job) and not store.errors(job) for job in jobs)
     return 0 if is_whole else 1
 

@@ -90,6 +90,7 @@ class LazyVectorEnv(VectorEnv):
         last_query: gives the policy's query since its last call, if any; each env's `add_query` gets it
             before a step.
         num_tasks: vector envs of the evaluation, this one among them; each runs as many episodes.
+        results_path: file of `--env.results_path` that the envs write to; None: they write none.
     """
 
     def __init__(
@@ -101,9 +102,11 @@ class LazyVectorEnv(VectorEnv):
         on_first_reset: Callable[[Any], None] | None = None,
         last_query: Callable[[], Query | None] = lambda: None,
         num_tasks: int = 1,
+        results_path: str | None = None,
     ) -> None:
         probe = make_ones[0]()
         self.num_envs = len(make_ones)
+        self.results_path = results_path
         self.single_observation_space = probe.observation_space
         self.single_action_space = probe.action_space
         self.observation_space = gym.vector.utils.batch_space(probe.observation_space, self.num_envs)

@@ -1,41 +1,293 @@
-"""Success rates as a table for a paper."""
+"""Success rates as tables for a paper, in LaTeX with the package `booktabs`."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
 
-from lerobot_bomb.report.cells import INTERVALS, rate
-from lerobot_bomb.results.groups import Group, by_condition
+from lerobot_bomb.conditions import AxisCondition
+from lerobot_bomb.files import file_names
+from lerobot_bomb.report.cells import INTERVALS
+from lerobot_bomb.results.comparison import Comparisons, can_compare, compare
+from lerobot_bomb.results.groups import POLICY, Group, Policy, differing, groups_of, policies_of, rate_of
+from lerobot_bomb.results.overview import Row, rows_of
+from lerobot_bomb.results.pairs import PairedComparison, describe_test
+from lerobot_bomb.results.record import describe_numbers
+from lerobot_bomb.stats import SIGNIFICANT, Rate
+from lerobot_bomb.tables import printable, shortened
 
 SPECIAL = {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+    "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}",
     **{character: f"\\{character}" for character in "_%&#${}"},
 }  # fmt: skip
+NEEDS = "% needs \\usepackage{booktabs}\n"
+NOTHING = "--"  # in a cell
+MAX_BESIDE = 3  # policies in columns of their own; more stand below each other
+SMALLEST_P = 0.001
+STATED = (POLICY, "suite", "task_version")  # settings that every table says
+
+type Wins = set[tuple[str, str, AxisCondition]]  # the first group's name, which is better than the second's
 
 
-def latex_table(groups: Sequence[Group]) -> str:
-    r"""Write a `tabular` of the package `booktabs`: a line for each condition, a column for each group."""
-    by_group = [by_condition(group.records) for group in groups]
-    conditions = list(dict.fromkeys(condition for by in by_group for condition in by))
-    numbers = sorted({len(records) for by in by_group for records in by.values()})
+@dataclass(frozen=True)
+class _Entry:
+    """A policy of a table, and its rows."""
+
+    group: Group
+    rows: dict[AxisCondition, Row]
+
+    @property
+    def name(self) -> str:
+        return _escaped(shortened(self.group.policy))
+
+
+type _Table = list[_Entry]
+
+
+def latex_tables(groups: Sequence[Group]) -> str:
+    """Write a `table` for each suite: success and its change, conditions by policies; the best in bold."""
+    tables = _tables(groups)
+    labels = file_names([_label(table[0].group) for table in tables])
+    apart = [name for name in differing([table[0].group for table in tables]) if name not in STATED]
+    wins = _wins(groups, tables)
+    return NEEDS + "\n".join(
+        _written(table, label, apart, wins) for table, label in zip(tables, labels, strict=True)
+    )
+
+
+def comparison_table(comparisons: Comparisons) -> str:
+    """Write a `table` of two policies on the same episodes; the better in bold."""
+    conditions = comparisons.conditions
+    groups = groups_of(record for each in conditions for pair in each.pairs for record in pair)
+    a, b = (_escaped(shortened(name)) for name in comparisons.names)
+    caption = (
+        f"{_where(groups, f' of {a} (A) and {b} (B)')}. B $-$ A: in points, on the same episodes, with "
+        rf"Newcombe's 95 \% interval for pairs; $p$: {_escaped(describe_test(len(conditions)))}. "
+        f"Bold: better, $p < {SIGNIFICANT}$. {_simulated(groups)}"
+    )
+    header = [_line("condition", "A", "B", "B $-$ A", "$p$", "pairs")]
+    return NEEDS + _float(caption, "comparison", "lrrrrr", header, [*map(_compared_line, conditions)])
+
+
+def _compared_line(compared: PairedComparison) -> str:
+    difference = compared.counts.difference
+    is_better = compared.is_shown and difference < 0, compared.is_shown and difference > 0
+    rates = [rate_of(list(records)) for records in zip(*compared.pairs, strict=True)]
+    low, high = compared.interval
+    return _line(
+        _escaped(compared.condition),
+        *map(_rate, rates, is_better),
+        f"{_points(difference)} [{_points(low)}, {_points(high)}]",
+        _p(compared.p_value),
+        str(compared.counts.n),
+    )
+
+
+def _tables(groups: Sequence[Group]) -> list[_Table]:
+    """Split groups into those that differ in nothing but their policies."""
+    tables: list[_Table] = []
+    for group in groups:
+        entry = _Entry(group, {row.condition: row for row in rows_of(group)})
+        fits = (table for table in tables if all(_is_beside(each.group, group) for each in table))
+        if (table := next(fits, None)) is None:
+            tables.append([entry])
+        else:
+            table.append(entry)
+    return tables
+
+
+def _is_beside(group: Group, other: Group) -> bool:
+    return group.policy != other.policy and can_compare(group, other)
+
+
+def _wins(groups: Sequence[Group], tables: list[_Table]) -> Wins:
+    """Return where a group is better than another, as `compare` tests it; of those that may be the best."""
+    names = {id(record): group.name for group in groups for record in group.records}
+    leading = {policy for table in tables for policy in _leading(table)}
+    wins: Wins = set()
+    for pair in combinations(policies_of(groups), 2):
+        if not leading.isdisjoint(policy.short_name for policy in pair):
+            for each in _compared(*pair):
+                better, worse = each.pairs[0] if each.counts.difference < 0 else each.pairs[0][::-1]
+                if each.is_shown:
+                    wins.add((names[id(better)], names[id(worse)], better.spec.condition))
+    return wins
+
+
+def _leading(table: _Table) -> set[str]:
+    """Return the policies that have the highest rate under some condition."""
+    rows: dict[AxisCondition, list[Row]] = {}
+    for entry in table:
+        for condition, row in entry.rows.items():
+            rows.setdefault(condition, []).append(row)
+    best = (max(each, key=lambda row: row.rate.share) for each in rows.values() if len(each) > 1)
+    return {row.group.policy for row in best}
+
+
+def _compared(first: Policy, second: Policy) -> list[PairedComparison]:
+    try:
+        return compare(first.records, second.records).conditions
+    except ValueError:  # no episode in common
+        return []
+
+
+def _is_best(row: Row, table: _Table, wins: Wins) -> bool:
+    """Return True if a policy is better than every other that has the condition."""
+    others = [each.rows[row.condition] for each in table if row.condition in each.rows]
+    others = [each for each in others if each.group is not row.group]
+    return bool(others) and all(
+        row.rate.share > each.rate.share and (row.group.name, each.group.name, row.condition) in wins
+        for each in others
+    )
+
+
+def _written(table: _Table, label: str, apart: list[str], wins: Wins) -> str:
+    has_changes = any(row.change for entry in table for row in entry.rows.values())
+    best = {id(row) for entry in table for row in entry.rows.values() if _is_best(row, table, wins)}
+    columns = ["success", *(["change", "$p$"] if has_changes else [])]
+    conditions = list(dict.fromkeys(condition for entry in table for condition in entry.rows))
+    cells = {
+        (entry.group.name, condition): _cells(entry.rows.get(condition), best, len(columns))
+        for entry in table
+        for condition in conditions
+    }
+    write = _beside if len(table) <= MAX_BESIDE else _below
+    caption = _caption(table, apart, is_bold=bool(best))
+    return _float(caption, label, *write(table, conditions, columns, cells))
+
+
+type _Cells = dict[tuple[str, AxisCondition], list[str]]  # of a group's name and a condition
+
+
+def _beside(
+    table: _Table, conditions: list[AxisCondition], columns: list[str], cells: _Cells
+) -> tuple[str, list[str], list[str]]:
+    """Return alignment, header and lines of a table with the policies beside each other."""
+    width = len(columns)
+    if width == 1:
+        header = [_line("condition", *(entry.name for entry in table))]
+    else:
+        header = _spanned([entry.name for entry in table], columns)
     lines = [
-        r"\begin{tabular}{l" + "r" * len(groups) + "}",
-        r"\toprule",
-        _line("condition", *(group.name for group in groups)),
-        r"\midrule",
-        *(
-            _line(condition, *(rate(by.get(condition, [])).text for by in by_group))
-            for condition in conditions
-        ),
-        r"\bottomrule",
-        r"\end{tabular}",
+        _line(_escaped(condition), *(cell for entry in table for cell in cells[entry.group.name, condition]))
+        for condition in conditions
     ]
-    episodes = " or ".join(map(str, numbers))
-    note = f"% success, with {INTERVALS}; {episodes} episodes each\n"
-    return note + "\n".join(lines) + "\n"
+    return "l" + "r" * width * len(table), header, lines
+
+
+def _spanned(names: list[str], columns: list[str]) -> list[str]:
+    """Return a header with names above columns that they all have."""
+    width = len(columns)
+    above = [rf"\multicolumn{{{width}}}{{c}}{{{name}}}" for name in names]
+    starts = [2 + place * width for place in range(len(names))]
+    rules = " ".join(rf"\cmidrule(lr){{{start}-{start + width - 1}}}" for start in starts)
+    return [_line("", *above), rules, _line("condition", *columns * len(names))]
+
+
+def _below(
+    table: _Table, conditions: list[AxisCondition], columns: list[str], cells: _Cells
+) -> tuple[str, list[str], list[str]]:
+    """Return alignment, header and lines of a table with the policies below each other."""
+    lines: list[str] = []
+    for condition in conditions:
+        having = [entry for entry in table if condition in entry.rows]
+        lines += [r"\addlinespace"] if lines else []
+        for place, entry in enumerate(having):
+            first = "" if place else _escaped(condition)
+            lines.append(_line(first, entry.name, *cells[entry.group.name, condition]))
+    return "ll" + "r" * len(columns), [_line("condition", "policy", *columns)], lines
+
+
+def _cells(row: Row | None, best: set[int], number: int) -> list[str]:
+    if row is None:
+        return [NOTHING] * number
+    cells = [_rate(row.rate, id(row) in best)]
+    if row.change is not None:
+        cells += [_points(row.change.counts.difference), _p(row.change.p_value)]
+    return cells + [NOTHING] * (number - len(cells))
+
+
+def _caption(table: _Table, apart: list[str], is_bold: bool) -> str:
+    groups = [entry.group for entry in table]
+    changes = [row.change for entry in table for row in entry.rows.values() if row.change]
+    parts = [f"{_where(groups)}."]
+    if changes:
+        numbers = {each.num_conditions for each in changes}
+        test = describe_test(numbers.pop()) if len(numbers) == 1 else "exact McNemar test, adjusted (Holm)"
+        parts.append(f"Change: in points, from the same episodes unperturbed; $p$: {_escaped(test)}.")
+    if len(table) > 1:
+        test = f"$p < {SIGNIFICANT}$, exact McNemar test on the same episodes, adjusted for conditions (Holm)"
+        claim = "Bold: better" if is_bold else "Under no condition is a policy shown to be better"
+        parts.append(f"{claim} than every other one ({test}).")
+    parts += [_escaped(f"{name}: {groups[0].settings.get(name, '')}.") for name in apart]
+    return " ".join([*parts, _simulated(groups)])
+
+
+def _where(groups: Sequence[Group], whose: str = "") -> str:
+    """Return 'Success in % on BOMB, task version 1.0, suite place: 20 episodes each, seeds ...'."""
+    benchmarks = dict.fromkeys(group.records[0].benchmark() for group in groups)
+    suites = dict.fromkeys(suite for group in groups if (suite := group.settings.get("suite")))
+    sizes = sorted({row.rate.n for group in groups for row in rows_of(group)})
+    episodes = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
+    seeds = describe_numbers(each.spec.seed for group in groups for each in group.records)
+    suite = f", suite {' and '.join(suites)}" if suites else ""
+    seeds = seeds.replace("..", "--")
+    number = f"{episodes} episode{'s' * (sizes[-1] > 1)} each, seeds {seeds}"
+    text = f"{' and '.join(benchmarks)}{suite}: {number}, with {INTERVALS}"
+    return rf"Success in \%{whose} on {_escaped(text)}"
+
+
+def _simulated(groups: Sequence[Group]) -> str:
+    """Return 'MuJoCo 3.8.1.'; of other simulators, their packages."""
+    texts = dict.fromkeys(
+        f"MuJoCo {settings['MuJoCo']}" if "MuJoCo" in settings else settings.get("simulator", "")
+        for settings in (group.settings for group in groups)
+    )
+    return _escaped(f"{' and '.join(filter(None, texts))}.")
+
+
+def _label(group: Group) -> str:
+    suite = group.settings.get("suite")
+    return f"{group.record_type.env_type}-{suite}" if suite else group.record_type.env_type
+
+
+def _float(caption: str, label: str, alignment: str, header: Sequence[str], lines: Sequence[str]) -> str:
+    return "\n".join(
+        [
+            r"\begin{table}",
+            r"\centering",
+            rf"\caption{{{caption}}}",
+            rf"\label{{tab:{label}}}",
+            r"\footnotesize",
+            rf"\begin{{tabular}}{{{alignment}}}",
+            r"\toprule",
+            *header,
+            r"\midrule",
+            *lines,
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+            "",
+        ]
+    )
 
 
 def _line(*cells: str) -> str:
-    return " & ".join(map(_escaped, cells)) + r" \\"
+    return " & ".join(cells) + r" \\"
+
+
+def _rate(rate: Rate, is_bold: bool) -> str:
+    text = rate.percent.replace(" %", "")
+    return rf"\textbf{{{text}}}" if is_bold else text
+
+
+def _points(share: float) -> str:
+    return f"${100 * share:+.1f}$"
+
+
+def _p(p_value: float) -> str:
+    return rf"$<$ {SMALLEST_P}" if p_value < SMALLEST_P else f"{p_value:.2g}"
 
 
 def _escaped(text: str) -> str:
-    return "".join(SPECIAL.get(character, character) for character in text)
+    return "".join(SPECIAL.get(character, character) for character in printable(text))

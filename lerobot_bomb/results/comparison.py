@@ -1,10 +1,11 @@
 """Comparison of two policies on the same episodes: which is better, by how much, and is it certain?"""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from lerobot_bomb.results.groups import POLICY, Group, groups_of, rate_of
+from lerobot_bomb.results.names import policy_names
 from lerobot_bomb.results.pairs import Pair, PairedComparison, compare_pairs, describe_test
 from lerobot_bomb.results.record import NOT_RECORDED, Record
 from lerobot_bomb.stats import format_p
@@ -16,7 +17,8 @@ type Values = dict[str, set[str]]  # of settings
 class Comparisons:
     """Comparison of two sets of episodes, condition by condition."""
 
-    policies: tuple[str, str]
+    policies: tuple[str, str]  # as records describe them
+    names: tuple[str, str]  # the shortest that tell them apart
     conditions: list[PairedComparison]
     num_unpaired: tuple[int, int]  # episodes that the other policy did not run
 
@@ -25,9 +27,23 @@ class Comparisons:
         """Lowest end of all intervals: the second policy is better by at least that under every condition."""
         return min(each.interval[0] for each in self.conditions)
 
+    def verdicts(self) -> list[str]:
+        """Say under which conditions the second policy is better or worse."""
+        if len(self.conditions) == 1:
+            return [describe_verdict(self.conditions[0])]
+        signs = [each.counts.difference > 0 for each in self.conditions if each.is_shown]
+        number, num_better = len(self.conditions), sum(signs)
+        parts = [f"B is better under {num_better}"] if num_better else []
+        parts += [f"B is worse under {len(signs) - num_better}"] if num_better < len(signs) else []
+        parts += [f"no difference is shown under {number - len(signs)}"] if len(signs) < number else []
+        lines = [f"{each.condition}: {describe_verdict(each)}" for each in self.conditions]
+        return [f"of {number} conditions: {', '.join(parts)}", *(f"  {line}" for line in lines)]
+
     def lines(self) -> list[str]:
-        """Return the comparisons as lines of text."""
-        lines = [f"{name}: {policy}" for name, policy in zip("AB", self.policies, strict=True)]
+        """Return the verdicts, then the comparisons, as lines of text."""
+        a, b = self.names
+        lines = [f"A is {a}, B is {b}", *self.verdicts(), ""]
+        lines += [f"{name}: {policy}" for name, policy in zip("AB", self.policies, strict=True)]
         lines += ["A and B are the same policy"] if self.policies[0] == self.policies[1] else []
         for each in self.conditions:
             lines += [f"{each.condition}: {_num_pairs(each)}", *(f"  {line}" for line in _lines(each))]
@@ -41,6 +57,21 @@ class Comparisons:
         return [*lines, notes]
 
 
+def describe_verdict(compared: PairedComparison) -> str:
+    """Say whether the second policy is better, if the test shows it: 'B is better: +25.0 points ...'."""
+    p_value, n = format_p(compared.p_value), compared.counts.n
+    pairs = f"{n} pair{'s' * (n != 1)}"
+    if compared.is_shown:
+        word = "better" if compared.counts.difference > 0 else "worse"
+        return f"B is {word}: {compared.describe_difference(' points')}, {p_value}, {pairs}"
+    if compared.counts.difference == 0:
+        return f"no difference is shown in {pairs}"
+    points = f"{100 * compared.counts.difference:+.1f} points"
+    needed = compared.num_needed
+    more = f"; {needed} pairs would show one of this size" if needed else ""
+    return f"no difference is shown in {pairs} ({points}, {p_value}){more}"
+
+
 def _num_pairs(compared: PairedComparison) -> str:
     if compared.num_starts == len(compared.pairs):
         return f"{len(compared.pairs)} pairs"
@@ -51,15 +82,12 @@ def _num_pairs(compared: PairedComparison) -> str:
 
 def _lines(compared: PairedComparison) -> list[str]:
     """Return the pairs of a condition as lines of text."""
-    counts, (low, high), change = compared.counts, compared.interval, compared.describe_change()
-    needed = compared.num_needed
-    more = f"; {needed} pairs tell such a difference apart" if needed else ""
+    counts, change = compared.counts, compared.describe_change()
     rates = [rate_of(list(records)) for records in zip(*compared.pairs, strict=True)]
     return [
         *(f"{name}          {rate}" for name, rate in zip("AB", rates, strict=True)),
-        f"B - A      {100 * counts.difference:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}]; "
-        f"A alone succeeded in {counts.only_first}, B alone in {counts.only_second} of {counts.n} pairs, "
-        f"{format_p(compared.p_value)}{more}",
+        f"B - A      {compared.describe_difference(' points')}; A alone succeeded in {counts.only_first}, "
+        f"B alone in {counts.only_second} of {counts.n} pairs, {format_p(compared.p_value)}",
         *([f"           {change}"] if change else []),
     ]
 
@@ -69,8 +97,10 @@ def can_compare(first: Group, second: Group) -> bool:
     return not _apart(_values_of([first]), _values_of([second]))
 
 
-def compare(first: Sequence[Record], second: Sequence[Record]) -> Comparisons:
-    """Pair the episodes of two policies.
+def compare(
+    first: Sequence[Record], second: Sequence[Record], names: Mapping[str, str] | None = None
+) -> Comparisons:
+    """Pair the episodes of two policies; `names`: {key of a policy: its name}.
 
     Raises:
         ValueError: one side has several policies, or there is no pair; names what differs.
@@ -81,8 +111,13 @@ def compare(first: Sequence[Record], second: Sequence[Record]) -> Comparisons:
     if not pairs:
         raise ValueError(f"no episode is in both: {_why_none(*groups)}")
     num_first, num_second = (sum(len(group.records) for group in policy_groups) for policy_groups in groups)
+    chosen = names or {}
+    keys = [policy_groups[0].settings[POLICY] for policy_groups in groups]
+    given = {place: chosen[key] for place, key in enumerate(keys) if key in chosen}
+    first_name, second_name = policy_names([each[0].records[0].policy for each in groups], given)
     return Comparisons(
         policies=policies,
+        names=(first_name, second_name),
         conditions=compare_pairs(_by_condition(pairs)),
         num_unpaired=(num_first - len(pairs), num_second - len(pairs)),
     )

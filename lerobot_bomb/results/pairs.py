@@ -35,7 +35,7 @@ class PairedComparison:
     @property
     def num_needed(self) -> int | None:
         """Number of pairs for the test to find this difference; None if it did, or never will."""
-        if self.p_value < SIGNIFICANT:
+        if self.is_shown:
             return None
         return episodes_to_tell_apart(self.counts, SIGNIFICANT / self.num_conditions)
 
@@ -43,6 +43,16 @@ class PairedComparison:
     def num_starts(self) -> int:
         """Number of starts of the pairs, which are fewer than pairs where tasks share seeds."""
         return len({first.start_key for first, _ in self.pairs})
+
+    @property
+    def is_shown(self) -> bool:
+        """True if the test shows a difference."""
+        return self.p_value < SIGNIFICANT
+
+    def describe_difference(self, unit: str = "") -> str:
+        """Return '+25.0 [+3.8, +46.9]': second rate minus first in percentage points."""
+        low, high = self.interval
+        return f"{100 * self.counts.difference:+.1f}{unit} [{100 * low:+.1f}, {100 * high:+.1f}]"
 
     def describe_change(self) -> str:
         """Describe how the second records differ, apart from successes; '' if they do not."""

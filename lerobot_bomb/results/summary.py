@@ -56,16 +56,20 @@ def _pair_line(compared: PairedComparison) -> str:
     )
 
 
-def pair_lines(group: Group, groups: Sequence[Group]) -> list[str]:
-    """Describe how perturbations changed a group's successes, or why there is nothing to compare with."""
+def pair_lines(group: Group) -> list[str]:
+    """Describe how perturbations changed a group's successes."""
+    return list(map(_pair_line, compare_pairs(pair_with_nominal(group.records))))
+
+
+def describe_unpaired(group: Group, groups: Sequence[Group]) -> str:
+    """Say how many perturbed episodes have nothing to compare with, and the way out; '' if all have."""
     pairs = pair_with_nominal(group.records)
-    lines = list(map(_pair_line, compare_pairs(pairs)))
     paired = {id(record) for condition_pairs in pairs.values() for _, record in condition_pairs}
     left = [each for each in group.perturbed if id(each) not in paired]
     if not left:
-        return lines
+        return ""
     advice = 'add "none" to --env.perturbations'
     others = [other for other in groups if pair_with_nominal([*other.nominal, *left])]
     if others:
         advice = f"those of this file differ in {', '.join(differing([group, others[0]]))}"
-    return [*lines, f"  perturbed episodes without an unperturbed one to compare with: {len(left)}; {advice}"]
+    return f"perturbed episodes without an unperturbed one to compare with: {len(left)}; {advice}"

@@ -1,8 +1,9 @@
 """LeRobot's evaluation with an environment or a policy of ours: corrections of silent errors."""
 
 import logging
+import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from inspect import signature
 from types import ModuleType
 from typing import Any
@@ -57,8 +58,9 @@ def run_tasks_in_turn(is_needed: Callable[[Any], bool]) -> None:
 def tell_of_evaluations() -> None:
     """Let LeRobot's evaluation tell an environment how many episodes it counts, and film each to its end.
 
-    LeRobot films the start and each step, and then cuts off the last image, which names the outcome. Both are
-    for environments with `begin_evaluation`; others are evaluated as ever.
+    LeRobot films the start and each step, and then cuts off the last image, which names the outcome. At the
+    end, it names the command that shows the results. All are for environments with `begin_evaluation`; others
+    are evaluated as ever.
     """
 
     def telling(usual: Callable[..., Any]) -> Callable[..., Any]:
@@ -79,9 +81,24 @@ def tell_of_evaluations() -> None:
 
         return rollout
 
-    for module in _loaded_with("eval_main"):  # where both are looked up
+    def closing(usual: Callable[..., Any]) -> Callable[..., Any]:
+        def close_envs(envs: Any) -> None:
+            usual(envs)
+            for path in _results_paths(envs):
+                logging.info("next: lerobot-bomb results %s", shlex.quote(path))
+
+        return close_envs
+
+    for module in _loaded_with("eval_main"):  # where all are looked up
         replace(module, "eval_policy", telling)
         replace(module, "rollout", filming)
+        replace(module, "close_envs", closing)
+
+
+def _results_paths(envs: Mapping[str, Mapping[int, Any]]) -> list[str]:
+    """Return the files to which environments of ours have written results."""
+    paths = [getattr(env, "results_path", None) for of_group in envs.values() for env in of_group.values()]
+    return [path for path in dict.fromkeys(paths) if path is not None]
 
 
 def _but_first(call: Callable[[Any], None]) -> Callable[[Any], None]:
