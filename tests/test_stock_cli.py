@@ -46,10 +46,13 @@ def train(run: Run, dataset: Path, output_dir: Path, flags: str) -> Path:
     return output_dir / "checkpoints" / "last" / "pretrained_model"
 
 
-def test_the_expert_places_stones_through_lerobot_eval(stock_cli: Run, tmp_path: Path) -> None:
+def test_the_expert_places_stones_through_lerobot_eval(
+    stock_cli: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     flags = "--policy.type=bomb_expert --eval.n_episodes=4 --eval.batch_size=2 --eval.use_async_envs=true"
     info = evaluate(stock_cli, tmp_path, f"{flags} --seed=5")
     assert info["per_group"]["place"]["pc_success"] == 100.0
+    assert capsys.readouterr().err.count(f"next: lerobot-bomb results {tmp_path / 'results.jsonl'}\n") == 1
     rows = read_results(tmp_path / "results.jsonl", EpisodeResult)
     assert sorted(row.spec.seed for row in rows) == [5, 6, 7, 8]
     assert all(row.is_success and row.placement_error_mm < 10 for row in rows)

@@ -186,6 +186,27 @@ def test_lines_of_finished_jobs_are_there_before_the_sweep_has_ended(tmp_path: P
     assert list(states) == []
 
 
+def test_a_sweep_ends_with_the_command_that_shows_its_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small().write(tmp_path)
+
+    def give_up(store: Store, *_: object) -> None:
+        store.give_up(store.manifest.jobs[0], "no")
+
+    def finish(store: Store, *_: object) -> None:
+        (job,) = store.manifest.jobs
+        store.finish(job, lines_of(job), [])
+
+    monkeypatch.setattr("lerobot_bomb.commands.sweep.run_part", give_up)
+    assert sweep(tmp_path) == 1
+    assert "next:" not in capsys.readouterr().out
+    monkeypatch.setattr("lerobot_bomb.commands.sweep.run_part", finish)
+    assert sweep(tmp_path) == 0
+    results = f"  lerobot-bomb results {tmp_path / 'results.jsonl'}  # rates, changes and failures"
+    assert capsys.readouterr().out.splitlines()[-3:] == ["", "next:", results]
+
+
 def test_sigterm_ends_a_sweep_as_ctrl_c_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
