@@ -3,9 +3,8 @@
 import argparse
 from collections.abc import Sequence
 
-from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO, parse_conditions, path_flag
-from lerobot_bomb.commands.results_files import read_undamaged
+from lerobot_bomb.commands.results_files import policy_keys, read_undamaged
 from lerobot_bomb.results.comparison import compare
 from lerobot_bomb.results.groups import policy_key
 from lerobot_bomb.results.record import Record
@@ -53,29 +52,11 @@ def _two_policies(args: argparse.Namespace) -> tuple[list[Record], list[Record]]
 
 
 def _by_policy(records: list[Record], names: Sequence[str]) -> list[list[Record]]:
-    """Split records by policy name, in order of first appearance.
-
-    A name is a policy's type, its path, `bomb:NAME`, or any part of its description in `results`.
-
-    Raises:
-        ValueError: a name fits no policy, or several.
-    """
+    """Split records by policy: those that are named, or all in order of first appearance."""
     by_key: dict[str, list[Record]] = {}
     for record in records:
         by_key.setdefault(policy_key(record), []).append(record)
-    described = {key: policy_records[0].describe_policy() for key, policy_records in by_key.items()}
-    if not names:
-        return list(by_key.values())
-    chosen = []
-    for name in names:
-        keys = [key for key, text in described.items() if name in text.split()] or [
-            key for key, text in described.items() if checkpoint_path(name) in text
-        ]
-        if len(keys) != 1:
-            texts = "; ".join(described.values())
-            raise ValueError(f"--policies: {name} must name one policy of the file, not {len(keys)}: {texts}")
-        chosen.append(by_key[keys[0]])
-    return chosen
+    return [by_key[key] for key in (policy_keys("--policies", names, records) if names else by_key)]
 
 
 def run(args: argparse.Namespace) -> int:

@@ -5,6 +5,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_bomb.checkpoints.shipped import checkpoint_path
+from lerobot_bomb.results.groups import policy_key
 from lerobot_bomb.results.played import describe_missing_episodes
 from lerobot_bomb.results.reading import check_any, read_records
 from lerobot_bomb.results.record import Record, describe_numbers
@@ -88,3 +90,25 @@ def read_undamaged(path: Path) -> ResultsFile:
     if missing:
         print(missing, file=sys.stderr)
     return ResultsFile(numbered, len(damages), missing)
+
+
+def policy_keys(flag: str, names: Sequence[str], records: Sequence[Record]) -> list[str]:
+    """Return the key of each named policy.
+
+    A name is a policy's type, its path, `bomb:NAME`, or any part of its description in `results`.
+
+    Raises:
+        ValueError: a name fits no policy, or several.
+    """
+    first = {policy_key(each): each for each in reversed(records)}
+    described = {key: record.describe_policy() for key, record in reversed(first.items())}
+    found = []
+    for name in names:
+        keys = [key for key, text in described.items() if name in text.split()] or [
+            key for key, text in described.items() if checkpoint_path(name) in text
+        ]
+        if len(keys) != 1:
+            texts = "; ".join(described.values())
+            raise ValueError(f"{flag}: {name} must name one policy of the file, not {len(keys)}: {texts}")
+        found.append(keys[0])
+    return found

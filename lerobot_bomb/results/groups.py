@@ -1,12 +1,13 @@
 """Groups of records that may be pooled and paired."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
 
 from lerobot_bomb.conditions import NONE, AxisCondition
+from lerobot_bomb.results.names import numbered, policy_names
 from lerobot_bomb.results.reading import check_any, read_records
 from lerobot_bomb.results.record import NOT_RECORDED, Record, describe_numbers
 from lerobot_bomb.stats import Rate
@@ -14,7 +15,6 @@ from lerobot_bomb.stats import Rate
 POLICY = "policy"  # the one setting that the episodes of two policies may differ in
 # fields of a spec in which a group's episodes may differ: pooled ones in seed, paired ones in perturbations
 DRAWN = ("seed", "perturbations")
-SHOWN_DIGITS = 6  # of a SHA-256, where names are the same otherwise
 # fields that a group lists, but that keep no episodes apart
 LISTED = {
     "lerobot_bomb": "package_version",
@@ -28,7 +28,8 @@ LISTED = {
 class Group:
     """Episodes of one policy under one set of settings, each once."""
 
-    name: str  # unique among the groups beside it: 'act outputs/act, place'
+    name: str  # unique among the groups beside it: 'act, place'
+    policy: str  # short name of the policy, unique among the policies beside it
     settings: dict[str, str]  # what other groups may differ in
     records: list[Record]
     num_replaced: int  # records of episodes that were run again
@@ -108,8 +109,11 @@ def read_results(path: Path, record_type: type[Record] = Record) -> Sequence[Rec
     return [each for group in groups_of(records.values()) for each in group.records]
 
 
-def groups_of(records: Iterable[Record]) -> list[Group]:
-    """Split records into groups to pool and pair; of an episode that was run again, keep the last record."""
+def groups_of(records: Iterable[Record], names: Mapping[str, str] | None = None) -> list[Group]:
+    """Split records into groups to pool and pair; of an episode that was run again, keep the last record.
+
+    `names`: {key of a policy: its name}; the others get the shortest that tell them apart.
+    """
     episodes: dict[tuple[tuple[str, str], ...], dict[Any, Record]] = {}
     counts = Counter[tuple[tuple[str, str], ...]]()
     for record in records:
@@ -117,20 +121,33 @@ def groups_of(records: Iterable[Record]) -> list[Group]:
         episodes.setdefault(settings, {})[record.spec] = record
         counts[settings] += 1
     groups = [list(each.values()) for each in episodes.values()]
-    names = _told_apart([(_group_name(first), first) for first, *_ in groups])
+    by_policy = _policy_names([first for first, *_ in groups], names or {})
+    policies = [by_policy[dict(settings)[POLICY]] for settings in episodes]
+    group_names = [
+        f"{policy}, {suite}" if (suite := getattr(first.spec, "suite", None)) else policy
+        for policy, (first, *_) in zip(policies, groups, strict=True)
+    ]
     return [
-        Group(name, dict(settings), group, counts[settings] - len(group))
-        for name, settings, group in zip(names, episodes, groups, strict=True)
+        Group(name, policy, dict(settings), group, counts[settings] - len(group))
+        for name, policy, settings, group in zip(
+            numbered(group_names), policies, episodes, groups, strict=True
+        )
     ]
 
 
+def _policy_names(records: Sequence[Record], given: Mapping[str, str]) -> dict[str, str]:
+    """Return {key of a policy: its name}."""
+    by_key = {policy_key(each): each.policy for each in records}
+    chosen = {place: given[key] for place, key in enumerate(by_key) if key in given}
+    return dict(zip(by_key, policy_names([*by_key.values()], chosen), strict=True))
+
+
 def policies_of(groups: Iterable[Group]) -> list[Policy]:
-    """Return the policies of these groups."""
+    """Return the policies of groups that were made together."""
     by_key: dict[str, list[Group]] = {}
     for group in groups:
         by_key.setdefault(group.settings[POLICY], []).append(group)
-    first = [each[0].records[0] for each in by_key.values()]
-    return list(map(Policy, _told_apart([(policy_name(each), each) for each in first]), by_key.values()))
+    return [Policy(each[0].policy, each) for each in by_key.values()]
 
 
 def settings_of(record: Record) -> dict[str, str]:
@@ -174,35 +191,3 @@ def _fixed(record: Record) -> dict[str, Any]:
     """Return the fields that a record's spec fixes for all episodes that it is pooled with."""
     drawn = (*DRAWN, *record.drawn)
     return {name: value for name, value in vars(record.spec).items() if name not in drawn}
-
-
-def _told_apart(named: list[tuple[str, Record]]) -> list[str]:
-    """Make equal names different: by the weights of the records' policies, then by numbers."""
-    doubled = {name for name, number in Counter(name for name, _ in named).items() if number > 1}
-    long = [f"{name} {_weights(each)}".strip() if name in doubled else name for name, each in named]
-    still = {name for name, number in Counter(long).items() if number > 1}
-    numbers = Counter[str]()
-    told = []
-    for name in long:
-        numbers[name] += 1
-        told.append(f"{name} ({numbers[name]})" if name in still else name)
-    return told
-
-
-def policy_name(record: Record) -> str:
-    """Return 'TYPE', for a checkpoint with its folder: 'act outputs/act'."""
-    if record.policy is None:
-        return "policy not recorded"
-    path = record.policy.path
-    return record.policy.type + ("" if path is None else f" {'/'.join(path.rstrip('/').split('/')[-2:])}")
-
-
-def _group_name(record: Record) -> str:
-    """Return policy and suite: 'act outputs/act, place'."""
-    suite = getattr(record.spec, "suite", None)
-    return policy_name(record) + (f", {suite}" if suite else "")
-
-
-def _weights(record: Record) -> str:
-    sha256 = None if record.policy is None else record.policy.weights_sha256
-    return (sha256 or "")[:SHOWN_DIGITS]

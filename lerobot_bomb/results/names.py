@@ -1,0 +1,90 @@
+"""Short names of policies, each the shortest that tells it from those beside it."""
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+
+from lerobot_bomb.results.origin import PolicyIdentity
+
+UNKNOWN = "policy not recorded"
+SHIPPED = re.compile(r"(?:^|/)lerobot_bomb/checkpoints/weights/([^/]+)/?$")  # the folder of `bomb:NAME`
+SHOWN_DIGITS = 6  # of a SHA-256, where names are the same otherwise
+
+
+def policy_names(
+    policies: Sequence[PolicyIdentity | None], given: Mapping[int, str] | None = None
+) -> list[str]:
+    """Name each policy: its type or `bomb:NAME`; of one type, also the parts of their paths that differ.
+
+    `given`: {place in `policies`: its name}.
+    """
+    names = [_base(each) for each in policies]
+    names = _extended(names, policies, _path_parts)
+    for part in (_interventions, _weights, _settings):
+        names = _extended(names, policies, lambda several, part=part: [part(each) for each in several])
+    chosen = given or {}
+    return numbered([chosen.get(place, name) for place, name in enumerate(names)])
+
+
+def numbered(names: Sequence[str]) -> list[str]:
+    """Make equal names different: 'act (1)', 'act (2)'."""
+    doubled = {name for name, number in Counter(names).items() if number > 1}
+    numbers = Counter[str]()
+    told = []
+    for name in names:
+        numbers[name] += 1
+        told.append(f"{name} ({numbers[name]})" if name in doubled else name)
+    return told
+
+
+def _base(policy: PolicyIdentity | None) -> str:
+    if policy is None:
+        return UNKNOWN
+    shipped = SHIPPED.search(policy.path or "")
+    return f"bomb:{shipped[1]}" if shipped else policy.type
+
+
+def _extended(
+    names: list[str],
+    policies: Sequence[PolicyIdentity | None],
+    parts: Callable[[list[PolicyIdentity | None]], list[str]],
+) -> list[str]:
+    """Add a part to every name that several policies have."""
+    extended = list(names)
+    for name, number in Counter(names).items():
+        if number > 1:
+            places = [place for place, each in enumerate(names) if each == name]
+            for place, part in zip(places, parts([policies[each] for each in places]), strict=True):
+                extended[place] = f"{name} {part}".strip()
+    return extended
+
+
+def _path_parts(policies: Sequence[PolicyIdentity | None]) -> list[str]:
+    """Return the parts of the policies' paths between those that all begin and end with."""
+    paths = [((each and each.path) or "").strip("/").split("/") for each in policies]
+    first = _num_shared(paths)
+    paths = [path[first:] for path in paths]
+    last = _num_shared([path[::-1] for path in paths])
+    return ["/".join(path[: len(path) - last]) for path in paths]
+
+
+def _num_shared(paths: Sequence[Sequence[str]]) -> int:
+    """Return how many parts all paths begin with."""
+    number = 0
+    for parts in zip(*paths, strict=False):
+        if len(set(parts)) > 1:
+            break
+        number += 1
+    return number
+
+
+def _interventions(policy: PolicyIdentity | None) -> str:
+    return "" if policy is None else " ".join(f"with {name}" for name in policy.interventions)
+
+
+def _weights(policy: PolicyIdentity | None) -> str:
+    return "" if policy is None else (policy.weights_sha256 or "")[:SHOWN_DIGITS]
+
+
+def _settings(policy: PolicyIdentity | None) -> str:
+    return "" if policy is None else (policy.settings_sha256 or "")[:SHOWN_DIGITS]
