@@ -17,6 +17,7 @@ from lerobot_bomb.report.cells import points
 from lerobot_bomb.results.pairs import compare_pairs
 
 CLASSES = (None, None, None, "imprecise", "wrong_intersection", "dropped")
+LEVELS = "Success over the levels of an axis"
 type Rows = list[dict[str, Any]]
 
 
@@ -48,8 +49,9 @@ def written(rows: Rows, tmp_path: Path) -> Path:
 
 
 def tables(folder: Path, section: str) -> list[dict[str, Any]]:
+    """Return the tables of a section, those of its charts first."""
     found = [each for each in json.loads((folder / "r.json").read_text()) if each["title"] == section]
-    return found[0]["tables"] if found else []
+    return [table for each in found for holder in [*each["charts"], each] for table in holder["tables"]]
 
 
 def recount(rows: Rows, policy: str, condition: str) -> Rows:
@@ -57,8 +59,8 @@ def recount(rows: Rows, policy: str, condition: str) -> Rows:
 
 
 def test_rates_and_costs_are_those_of_the_lines(rows: Rows, written: Path) -> None:
-    found = tables(written, "Success by condition")
-    assert [table["title"].split(",")[0] for table in found] == ["act", "fdvla"]
+    _, *found = tables(written, "Success")
+    assert [table["title"] for table in found] == ["act, place", "fdvla, place"]
     for table, policy in zip(found, ("act", "fdvla"), strict=True):
         assert [row[0] for row in table["rows"]] == ["none", "camera:2", "camera:4"]
         nominal = {row["spec"]["seed"]: row["is_success"] for row in recount(rows, policy, "none")}
@@ -77,7 +79,16 @@ def test_rates_and_costs_are_those_of_the_lines(rows: Rows, written: Path) -> No
 
 
 def test_failures_levels_and_the_board_are_those_of_the_lines(rows: Rows, written: Path) -> None:
-    for table, policy in zip(tables(written, "Why episodes failed"), ("act", "fdvla"), strict=True):
+    bars, *by_condition = tables(written, "Why episodes failed")
+    for bar, *cells in bars["rows"]:
+        policy, kind = bar.split(", ")
+        episodes = [row for row in rows if row["policy"]["type"] == policy]
+        episodes = [r for r in episodes if (r["spec"]["perturbations"] == "none") == (kind == "unperturbed")]
+        classes = Counter(row["failure"] or "success" for row in episodes)
+        counts = dict(zip(bars["header"][1:], cells, strict=True))
+        assert counts == {name: classes[name] for name in bars["header"][2:]} | {"episodes": len(episodes)}
+    assert len(bars["rows"]) == 4
+    for table, policy in zip(by_condition, ("act", "fdvla"), strict=True):
         names = table["header"][2:-2]
         for condition, _, *counts, right, there in table["rows"]:
             episodes = recount(rows, policy, condition)
@@ -89,18 +100,44 @@ def test_failures_levels_and_the_board_are_those_of_the_lines(rows: Rows, writte
             grounded = [row for row in put_down if row["nearest_intersection"] == row["target"]]
             assert (right["successes"], right["n"]) == (len(grounded), len(put_down))
             assert there["n"] == len(grounded)
-    for table, policy in zip(tables(written, "Axis by level"), ("act", "fdvla"), strict=True):
+    for table, policy in zip(tables(written, LEVELS)[:2], ("act", "fdvla"), strict=True):
         ((axis, *levels),) = table["rows"]
         assert axis == "camera" and table["header"][1:] == ["0", "2", "4"]
         expected = [
             sum(r["is_success"] for r in recount(rows, policy, c)) for c in ("none", "camera:2", "camera:4")
         ]
         assert [level["successes"] for level in levels] == expected
-    named, missed, *_ = tables(written, "The board")
-    of_act = [row for row in rows if row["policy"]["type"] == "act"]
-    assert sum(cell["n"] for _, *cells in named["rows"] for cell in cells if cell != "-") == len(of_act)
-    num_missed = sum(row["failure"] == "wrong_intersection" and row["target"] != [0, 4] for row in of_act)
-    assert missed["rows"][0][5] == num_missed
+
+
+def test_the_board_is_that_of_the_lines(rows: Rows, written: Path) -> None:
+    named, missed = tables(written, "The board")
+    for policy, row, column, success in named["rows"]:
+        episodes = [r for r in rows if r["policy"]["type"] == policy and r["target"] == [row, column]]
+        counted = sum(r["is_success"] for r in episodes)
+        assert (success["successes"], success["n"]) == (counted, len(episodes))
+    assert sum(each[3]["n"] for each in named["rows"]) == len(rows)
+    expected = Counter(
+        (row["policy"]["type"], *row["target"], *row["nearest_intersection"])
+        for row in rows
+        if row["failure"] == "wrong_intersection" and row["target"] != [0, 4]
+    )
+    assert {tuple(row[:5]): row[5] for row in missed["rows"]} == expected
+
+
+def test_the_distribution_of_errors_is_that_of_the_lines(rows: Rows, written: Path) -> None:
+    (table,) = tables(written, "Placement error")
+    for name, number, *percentiles in table["rows"]:
+        policy, kind = name.split(", ")
+        errors = sorted(
+            row["placement_error_mm"]
+            for row in rows
+            if row["policy"]["type"] == policy
+            and (row["spec"]["perturbations"] == "none") == (kind == "unperturbed")
+            and row["failure"] in (None, "imprecise", "wrong_intersection")
+        )
+        assert (number, percentiles[0], percentiles[-1]) == (len(errors), errors[0], errors[-1])
+        assert percentiles[10] == errors[-(-len(errors) // 2) - 1]  # the median, an error of the lines
+    assert len(table["rows"]) == 4
 
 
 def test_two_policies_are_compared_on_their_common_episodes(rows: Rows, written: Path) -> None:
@@ -138,7 +175,7 @@ def test_every_command_has_the_same_p_value_for_the_same_pairs(
     said = capsys.readouterr().out
     # 2 / 2^6 of one pair of conditions of two
     assert said.count("camera:3: 6 pairs, 6 lost, 0 won, p = 0.062 (exact McNemar test, adjusted for 2") == 2
-    act, *_ = tables(tmp_path, "Success by condition")
+    _, act, *_ = tables(tmp_path, "Success")
     assert {row[0]: row[4] for row in act["rows"]} == {"none": "", "camera:3": 2 * 2 / 2**6, "light:3": 1.0}
     assert "p: exact McNemar test, adjusted for 2 conditions (Holm)." in act["note"]
     # two policies: all six conditions of both suites are one family, in `compare` and on the page alike
@@ -178,7 +215,7 @@ def test_without_an_episode_there_is_no_report(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_axes_are_ranked_by_what_a_level_costs(rows: Rows, written: Path) -> None:
-    for table, policy in zip(tables(written, "Sensitivity to an axis"), ("act", "fdvla"), strict=True):
+    for table, policy in zip(tables(written, LEVELS)[2:], ("act", "fdvla"), strict=True):
         ((axis, found, share),) = table["rows"]
         episodes = [row for row in rows if row["policy"]["type"] == policy]
         levels = [row["levels"].get("camera", 0) for row in episodes]
@@ -195,7 +232,7 @@ def test_what_an_axis_explains_is_counted_where_levels_were_drawn(rows: Rows, tm
         drawn.append(line | {"levels": {"camera": camera, "light": light}})
     (tmp_path / "d.jsonl").write_text("".join(json.dumps(row) + "\n" for row in drawn))
     assert main(["report", str(tmp_path / "d.jsonl"), f"--output={tmp_path / 'r.html'}"]) == 0
-    (table,) = tables(tmp_path, "Sensitivity to an axis")
+    (table,) = tables(tmp_path, LEVELS)
     shares = {axis: share for axis, _, share in table["rows"]}
     assert list(shares) == ["camera", "light"]
     assert shares["camera"] == pytest.approx(1.0) and shares["light"] < 0.05

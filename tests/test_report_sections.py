@@ -21,6 +21,7 @@ from lerobot_bomb.report.sections.published import MARK, SPEED, SUCCESS
 from lerobot_bomb.results.origin import PolicyIdentity
 
 type Rows = list[dict[str, Any]]
+LEVELS = "Success over the levels of an axis"
 TOLD = PolicyIdentity(
     FDVLA.type,
     "audit/other_instruction",
@@ -68,16 +69,7 @@ def columns(table: dict[str, Any]) -> list[dict[str, Any]]:
     return [dict(zip(table["header"], row, strict=True)) for row in table["rows"]]
 
 
-# Summary
-
-
-def test_the_summary_has_the_worst_condition_and_its_success(report: Callable[..., dict[str, Any]]) -> None:
-    failures = {"none": None, "light:3": None, "camera:3": "dropped"}
-    rows = [values(0, failure, spec={"perturbations": each}) for each, failure in failures.items()]
-    (row,) = columns(report(rows)["Summary"]["tables"][0])
-    assert (row["worst condition"], row["its success"]["successes"]) == ("camera:3", 0)
-    (row,) = columns(report(rows[:1])["Summary"]["tables"][0])
-    assert (row["worst condition"], row["its success"]) == ("-", "-")
+# Success
 
 
 def perturbed(failures: Mapping[str, Sequence[str | None]], policy: PolicyIdentity = ACT) -> Rows:
@@ -89,70 +81,125 @@ def perturbed(failures: Mapping[str, Sequence[str | None]], policy: PolicyIdenti
     ]
 
 
+def summary(section: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the rows of the table of all policies."""
+    return columns(section["charts"][0]["tables"][0])
+
+
+def outcomes(successes: int, n: int) -> list[str | None]:
+    return [None] * successes + ["dropped"] * (n - successes)
+
+
 def test_conditions_of_one_seed_are_no_independent_episodes(report: Callable[..., dict[str, Any]]) -> None:
     # five seeds of ten fail under all of eleven conditions: as ten episodes, with t of 9 degrees of freedom
     conditions = [f"{axis}:{level}" for axis in ("camera", "light") for level in range(1, 6)] + ["camera:1-5"]
-    (table,) = report(perturbed(dict.fromkeys(conditions, [None, "dropped"] * 5)))["Summary"]["tables"]
-    pooled = columns(table)[0]["perturbed, all conditions"]
+    section = report(perturbed(dict.fromkeys(conditions, [None, "dropped"] * 5)))["Success"]
+    pooled = summary(section)[0]["perturbed"]
     assert (pooled["successes"], pooled["n"]) == (55, 110)
     assert (pooled["low"], pooled["high"]) == pytest.approx((0.2091, 0.7909), abs=1e-4)
-    assert "95 % Wilson intervals, clustered by seed" in table["note"]
-    (table,) = report(perturbed({each: ["dropped"] for each in conditions}))["Summary"]["tables"]
-    assert columns(table)[0]["perturbed, all conditions"] == {
-        "successes": 0,
-        "n": 11,
-        "low": None,
-        "high": None,
-    }
-
-
-def test_policies_are_compared_on_the_episodes_that_all_have(report: Callable[..., dict[str, Any]]) -> None:
-    act = perturbed({"none": [None] * 3, "camera:3": [None, None, "dropped"], "all:5": ["dropped"] * 3})
-    fdvla = perturbed({"none": [None] * 3, "camera:3": [None, "dropped"], "light:1": [None]}, FDVLA)
-    alone = perturbed({"none": [None] * 3}, PolicyIdentity("bomb_random"))
-    section = report(act, fdvla, alone)["Summary"]
-    rows = {row["policy, suite"].split()[0]: row for row in columns(section["tables"][0])}
-    shared = {name: row["perturbed, all conditions"] for name, row in rows.items()}
-    assert [shared[name]["successes"] for name in ("act", "fdvla")] == [2, 1]
-    assert [shared[name]["n"] for name in ("act", "fdvla")] == [2, 2]
-    assert shared["bomb_random,"] == "-"
-    assert [row["worst condition"] for row in rows.values()] == ["camera:3", "camera:3", "-"]
-    assert section["lines"] == [
-        "act outputs/act, place: 4 perturbed episodes are left out, which not all policies have",
-        "fdvla me/fdvla, place: 1 perturbed episodes are left out, which not all policies have",
+    assert "95 % Wilson intervals, clustered by seed" in section["charts"][0]["tables"][0]["note"]
+    section = report(perturbed({each: ["dropped"] for each in conditions}))["Success"]
+    assert summary(section)[0]["perturbed"] == {"successes": 0, "n": 11, "low": None, "high": None}
+    assert section["statements"] == [
+        "act has no unperturbed episodes on place; it succeeds in 0 of 11 (0 %) perturbed ones. "
+        "What a condition costs is not known: no perturbed episode was also run unperturbed."
     ]
-    fewer = perturbed({"none": [None] * 2}, FDVLA)
-    (line, _) = report(act, fewer)["Summary"]["lines"]
-    assert (
-        line == "act outputs/act, place: other policies have other unperturbed episodes; pairs compare below"
+
+
+def test_a_policy_is_told_in_one_sentence_that_is_true_for_its_number_of_episodes(
+    report: Callable[..., dict[str, Any]],
+) -> None:
+    lost = {"none": 20, "all:3": 2, "camera:3": 8, "light:3": 18, "start:3": 20}
+    told = report(perturbed({each: outcomes(number, 20) for each, number in lost.items()}))
+    # 12 lost of 12: 2 x 2 / 2^12 x 3 (Holm, second of four); 18 of 18: 2 / 2^18 x 4
+    assert told["Success"]["statements"] == [
+        "act succeeds in 20 of 20 (100 % [84, 100]) unperturbed episodes on place, and in 2 of 20 "
+        "(10 % [3, 30]) under all:3, 90 points less (p = 3.1e-05). It loses most to camera:3 (60 points "
+        "less, p = 0.0015). No other axis shows a difference; about 101 seeds would show the largest, "
+        "light:3 (10 points less)."
+    ]
+
+
+def test_one_episode_is_one_episode(report: Callable[..., dict[str, Any]]) -> None:
+    sections = report([values(0)])
+    assert sections["Success"]["statements"] == [
+        "act succeeds in 1 of 1 (100 % [21, 100]) unperturbed episodes on place."
+    ]
+    assert "Why episodes failed" not in sections and "Every policy under every condition" not in sections
+
+
+def test_policies_are_ranked_on_the_episodes_that_all_have(report: Callable[..., dict[str, Any]]) -> None:
+    act = perturbed({"none": [None] * 3, "camera:3": [None, None, "dropped"], "all:5": ["dropped"] * 3})
+    fdvla = perturbed({"none": [None, "dropped"], "camera:3": [None, "dropped"], "light:1": [None]}, FDVLA)
+    section = report(act, fdvla)["Success"]
+    assert [row["on shared episodes"]["n"] for row in summary(section)] == [2, 2]
+    assert section["statements"][:2] == [
+        "Ranking on place by the 2 unperturbed episodes that all policies have: act 100 %, fdvla 50 %.",
+        "act against fdvla: unperturbed, no difference is shown: act has 50 points [-27, 91] more (2 pairs, "
+        "p = 1; about 17 pairs would show it). Of the one perturbed condition, none shows a difference.",
+    ]
+    assert section["lines"] == [
+        "act, place: 5 of its 9 episodes were not run by all policies; pairs and ranking leave them out",
+        "fdvla, place: 1 of its 5 episodes were not run by all policies; pairs and ranking leave them out",
+    ]
+
+
+def test_a_tie_is_a_tie_and_what_is_sure_is_said(report: Callable[..., dict[str, Any]]) -> None:
+    act = perturbed({"none": outcomes(9, 10), "all:3": outcomes(10, 10), "light:3": outcomes(0, 10)})
+    fdvla = perturbed({"none": outcomes(9, 10), "all:3": outcomes(0, 10), "light:3": outcomes(10, 10)}, FDVLA)
+    assert report(act, fdvla)["Success"]["statements"][:2] == [
+        "Ranking on place by the 10 unperturbed episodes that all policies have: act and fdvla tie at 90 %.",
+        "act against fdvla: unperturbed, they tie (9 successes each in 10 pairs). Of 2 perturbed conditions, "
+        "act is better under 1, most under all:3 (by 100 points) and fdvla is better under 1, most under "
+        "light:3 (by 100 points).",
+    ]
+    better = perturbed({"none": outcomes(10, 10)}), perturbed({"none": outcomes(1, 10)}, FDVLA)
+    assert report(*better)["Success"]["statements"][1] == (
+        "act against fdvla: unperturbed, act is better by 90 points [49, 98] (10 pairs, p = 0.0039)."
     )
 
 
-def test_other_settings_are_no_peers(report: Callable[..., dict[str, Any]]) -> None:
+def test_policies_without_a_common_episode_are_not_ranked(report: Callable[..., dict[str, Any]]) -> None:
+    section = report(perturbed({"light:3": [None]}), perturbed({"camera:3": [None]}, FDVLA))["Success"]
+    assert section["statements"][0] == ("No ranking on place: act and fdvla have no episode in common.")
+    assert [row["on shared episodes"] for row in summary(section)] == ["-", "-"]
+
+
+def test_other_settings_are_panels_of_their_own(report: Callable[..., dict[str, Any]]) -> None:
     small = [row | {"image_size": 64} for row in perturbed({"light:1": [None]}, FDVLA)]
-    section = report(perturbed({"camera:3": ["dropped"] * 3}), small)["Summary"]
-    assert [row["perturbed, all conditions"]["n"] for row in columns(section["tables"][0])] == [3, 1]
-    assert section["lines"] == []
+    section = report(perturbed({"camera:3": ["dropped"] * 3}), small)["Success"]
+    assert [row["on shared episodes"] for row in summary(section)] == ["-", "-"]
+    assert section["lines"] == [] and "image_size 64" in section["statements"][1]
 
 
-def test_a_tie_has_no_worst_condition(report: Callable[..., dict[str, Any]]) -> None:
-    half, none = [None, "dropped"], [None, None]
-    (row,) = columns(
-        report(perturbed({"camera:3": half, "light:3": none, "all:5": half}))["Summary"]["tables"][0]
-    )
-    assert (row["worst condition"], row["its success"]) == (["camera:3", "all:5"], 0.5)
-    (row,) = columns(report(perturbed({"camera:3": half, "light:3": half}))["Summary"]["tables"][0])
-    assert (row["worst condition"], row["its success"]) == (["camera:3", "light:3"], 0.5)
+def test_the_numbers_say_of_what_the_measures_are(report: Callable[..., dict[str, Any]]) -> None:
+    section = report([values(0)])["Success"]
+    assert "placement error" in summary(section)[0]["measures"]
+    note = section["charts"][0]["tables"][0]["note"]
+    assert "placement error: median" in note and "moves made" not in note
 
 
-def test_the_summary_says_of_what_its_measures_are(report: Callable[..., dict[str, Any]]) -> None:
-    (table,) = report([values(0)])["Summary"]["tables"]
-    (row,) = columns(table)
-    assert "placement error" in row["measures"] and "moves made" not in row["measures"]
-    assert "placement error: median" in table["note"] and "moves made" not in table["note"]
+def test_a_name_that_is_given_stands_everywhere(
+    report: Callable[..., dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = perturbed({"none": [None], "light:3": ["dropped"]}) + perturbed({"none": [None]}, FDVLA)
+    sections = report(rows, flags=("--names=act=the baseline,me/fdvla=ours",))
+    assert [row["policy, suite"] for row in summary(sections["Success"])] == [
+        "the baseline, place",
+        "ours, place",
+    ]
+    page = (tmp_path / "out" / "r.html").read_text()
+    assert "<h1>the baseline and ours on bomb (place): 3 episodes, 2 conditions</h1>" in page
+    path = str(write(tmp_path / "r.jsonl", rows))
+    assert main(["report", path, f"--output={tmp_path / 'r.html'}", "--names=pi0=x"]) == 1
+    assert "--names: pi0 must name one policy of the file, not 0: act outputs/act" in capsys.readouterr().err
+    for wrong in ("act", "act=", "=x", "act=x,fdvla=x"):
+        with pytest.raises(SystemExit, match="2"):
+            main(["report", path, f"--names={wrong}"])
+        assert "must be POLICY=NAME, several joined by commas" in capsys.readouterr().err
 
 
-# Sensitivity
+# Levels of axes
 
 
 def at_levels(condition: str, levels: dict[str, int], failures: Sequence[str | None]) -> Rows:
@@ -173,7 +220,7 @@ def test_a_slope_is_of_the_episodes_in_which_the_axis_alone_was_on(
         *at_levels("camera:4+light:4", {"camera": 4, "light": 4}, won),
         *at_levels("object:5", {"object": 5}, won),
     ]
-    (table,) = report(rows)["Sensitivity to an axis"]["tables"]
+    _, table = report(rows)[LEVELS]["charts"][0]["tables"]
     (camera, other) = columns(table)
     assert (camera["axis"], other["axis"]) == ("camera", "object")
     assert camera["points per level"]["per_level"] == pytest.approx(-0.25)  # 1, 1/2, 0 at the levels 0, 2, 4
@@ -185,13 +232,13 @@ def test_a_slope_is_of_the_episodes_in_which_the_axis_alone_was_on(
 
 def test_one_level_of_an_axis_alone_says_nothing_of_it(report: Callable[..., dict[str, Any]]) -> None:
     one_level = at_levels("camera:2", {"camera": 2}, [None, "dropped"])
-    assert "Sensitivity to an axis" not in report(one_level)
+    assert LEVELS not in report(one_level)
     one_range = [
         *at_levels("camera:1-5", {"camera": 1}, [None, None]),
         *at_levels("camera:1-5+light:3", {"camera": 2, "light": 3}, [None, "dropped"]),
         *at_levels("camera:1-5+light:3", {"camera": 5, "light": 3}, ["dropped", "dropped"]),
     ]
-    assert "Sensitivity to an axis" not in report(one_range)
+    assert LEVELS not in report(one_range)
 
 
 def test_shares_are_of_the_episodes_in_which_several_levels_were_drawn(
@@ -204,7 +251,7 @@ def test_shares_are_of_the_episodes_in_which_several_levels_were_drawn(
         )
     ]
     fixed = at_levels("camera:3+light:3", {"camera": 3, "light": 3}, [None, "dropped"])
-    (table,) = report([*drawn, *fixed])["Sensitivity to an axis"]["tables"]
+    (table,) = report([*drawn, *fixed])[LEVELS]["tables"]
     shares = {row["axis"]: row["share of variance"] for row in columns(table)}
     # total 2 of 8 episodes, 7 degrees of freedom; within the levels of light 2, with 6
     assert shares == {"camera": pytest.approx(1.0), "light": pytest.approx(1 - (2 / 6) / (2 / 7))}
@@ -218,7 +265,7 @@ def test_the_efficiency_table_equals_a_recount(report: Callable[..., dict[str, A
         values(seed, inference=inference(seed), action_j2=0.1 * seed, action_j3=1.0) for seed in range(5)
     ]
     plain = [values(seed, policy=FDVLA) for seed in range(5)]
-    table, smoothness = report([*measured, *plain])["Efficiency"]["tables"]
+    table, smoothness = (each["tables"][0] for each in report([*measured, *plain])["Efficiency"]["charts"])
     (row,) = columns(table)  # nothing is shown of a policy that was not measured
     told = [each["inference"] for each in measured]
     queries = sum(each["num_queries"] for each in told)
@@ -239,7 +286,7 @@ def test_two_devices_are_two_lines(report: Callable[..., dict[str, Any]]) -> Non
         values(seed, inference=inference(seed, device=device, tokens=7.0))
         for seed, device in enumerate("aabb")
     ]
-    (table,) = report(rows)["Efficiency"]["tables"]
+    (table,) = report(rows)["Efficiency"]["charts"][0]["tables"]
     assert [(row["device"], row["p50, ms"]) for row in columns(table)] == [("a", 10.5), ("b", 12.5)]
     assert [row["tokens"] for row in columns(table)] == [7, 7]
 
@@ -247,9 +294,8 @@ def test_two_devices_are_two_lines(report: Callable[..., dict[str, Any]]) -> Non
 def test_smoothness_alone_is_shown_of_a_policy_without_a_network(
     report: Callable[..., dict[str, Any]],
 ) -> None:
-    (table,) = report([values(seed, action_j2=0.5, action_j3=0.25) for seed in range(3)])["Efficiency"][
-        "tables"
-    ]
+    rows = [values(seed, action_j2=0.5, action_j3=0.25) for seed in range(3)]
+    ((table,),) = (each["tables"] for each in report(rows)["Efficiency"]["charts"])
     (row,) = columns(table)
     assert (table["title"], row["J2"]["mean"], row["J3"]["mean"]) == ("Smoothness", 0.5, 0.25)
 

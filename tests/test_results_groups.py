@@ -10,9 +10,11 @@ from result_rows import ACT, FDVLA, old_row, printed, row
 
 from lerobot_bomb.bomb.board import COLORS
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION
+from lerobot_bomb.checkpoints.shipped import shipped_checkpoint, shipped_names
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.results.bomb import EpisodeResult, median_error_mm
 from lerobot_bomb.results.groups import read_results
+from lerobot_bomb.results.names import policy_names
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_bomb.results.summary import summarise
 
@@ -70,6 +72,42 @@ def test_results_of_different_task_versions_are_not_pooled(
     output = printed(path, "".join(new) + old, capsys)
     assert f"{path}: 2 episodes" in output and f"{path}: 1 episode" in output
     assert re.search(r"2 groups of episodes, .* they differ in .*task_version", output)
+
+
+def checkpoint(policy_type: str, path: str | None, digit: str = "0", **other: Any) -> PolicyIdentity:
+    return PolicyIdentity(policy_type, path, weights_sha256=digit * 64, **other)
+
+
+LAST = "checkpoints/last/pretrained_model"
+
+
+@pytest.mark.parametrize(
+    ("policies", "names"),
+    [
+        ([checkpoint("act", f"outputs/a/{LAST}"), PolicyIdentity("bomb_random")], ["act", "bomb_random"]),
+        ([checkpoint("act", f"/x/a/{LAST}"), checkpoint("act", f"/x/b/{LAST}")], ["act a", "act b"]),
+        ([checkpoint("act", "/x/010/m"), checkpoint("act", "/x/020/m")], ["act 010", "act 020"]),
+        ([checkpoint("act", "/x/a"), checkpoint("act", "/x/a/b")], ["act", "act b"]),
+        ([checkpoint("act", None), checkpoint("act", "x/a")], ["act", "act x/a"]),
+        ([checkpoint("act", "x", "1"), checkpoint("act", "x", "2")], ["act 111111", "act 222222"]),
+        (
+            [checkpoint("act", "x"), checkpoint("act", "x", interventions=("ReplaceTasks",))],
+            ["act", "act with ReplaceTasks"],
+        ),
+        ([None, PolicyIdentity("a"), PolicyIdentity("a")], ["policy not recorded", "a (1)", "a (2)"]),
+    ],
+)
+def test_a_policy_has_the_shortest_name_that_tells_it_from_the_others(
+    policies: list[PolicyIdentity | None], names: list[str]
+) -> None:
+    assert policy_names(policies) == names
+
+
+def test_a_shipped_policy_is_named_as_on_the_command_line_and_a_given_name_wins() -> None:
+    shipped = [checkpoint(name, str(shipped_checkpoint(name))) for name in shipped_names()]
+    names = [f"bomb:{name}" for name in shipped_names()]
+    assert policy_names(shipped) == names
+    assert policy_names([*shipped, checkpoint("act", "x")], {0: "ours"}) == ["ours", *names[1:], "act"]
 
 
 OTHER: dict[str, dict[str, Any]] = {

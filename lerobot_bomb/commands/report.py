@@ -9,28 +9,28 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from lerobot_bomb.commands.arguments import check_at_least, path_flag
-from lerobot_bomb.commands.results_files import check_outputs, read_undamaged
+from lerobot_bomb.commands.arguments import add_names_flag, check_at_least, path_flag
+from lerobot_bomb.commands.results_files import check_outputs, names_of, read_undamaged
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.report.page import render
 from lerobot_bomb.report.report import Report, Sample, sample_failures
-from lerobot_bomb.report.sections import build, conditions
-from lerobot_bomb.report.table import Section
+from lerobot_bomb.report.sections import build
+from lerobot_bomb.report.title import title_of
 from lerobot_bomb.results.groups import groups_of
 
-TITLE, DEFAULT = "Evaluation", Path("report.html")
+DEFAULT = Path("report.html")
 NUM_SAMPLES = 3  # of each class of failure, at least
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument(
-        "paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path"
-    )
-    parser.add_argument("--output", type=path_flag, default=DEFAULT, help=f"page (default: {DEFAULT})")
-    parser.add_argument("--title", default=TITLE, help=f"title of the page (default: {TITLE})")
+    add = parser.add_argument
+    add("paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path")
+    add("--output", type=path_flag, default=DEFAULT, help=f"page (default: {DEFAULT})")
+    add("--title", help="title of the page (default: the policies, tasks and number of episodes)")
+    add_names_flag(parser)
     videos = "replay this many failures of each class, and show their videos (default: 0)"
-    parser.add_argument("--videos", type=int, metavar="N", default=0, help=videos)
+    add("--videos", type=int, metavar="N", default=0, help=videos)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -42,7 +42,8 @@ def run(args: argparse.Namespace) -> int:
     page, tables, rates = (output.with_suffix(suffix) for suffix in (".html", ".json", ".csv"))
     check_outputs(args.paths, (page, tables, rates))
     files = {path: read_undamaged(path) for path in dict.fromkeys(args.paths)}
-    groups = groups_of([record for file in files.values() for record in file.records])
+    records = [record for file in files.values() for record in file.records]
+    groups = groups_of(records, names_of(args.names, records))
     numbered = {path: file.numbered for path, file in files.items()}
     samples = list(sample_failures(groups, numbered, max(NUM_SAMPLES, args.videos)))
     folder = page.with_name(f"{page.stem}_videos")
@@ -54,11 +55,12 @@ def run(args: argparse.Namespace) -> int:
         for path, file in files.items()
         if file.num_damaged
     ]
-    sections = build(Report(groups, samples, missing))
+    report = Report(groups, samples, missing)
+    sections = build(report)
     with written_whole(page, tables, rates) as (html, as_json, as_csv):
-        html.write_text(render(args.title, sections))
+        html.write_text(render(args.title or title_of(report), sections))
         as_json.write_text(json.dumps([section.as_json() for section in sections], indent=1) + "\n")
-        as_csv.write_text(_csv(sections))
+        as_csv.write_text(_csv(report))
     print(page, tables, rates, *([folder] if folder.is_dir() and args.videos else []), sep="\n")
     return 0
 
@@ -76,14 +78,14 @@ def _add_videos(samples: list[Sample], folder: Path, num_of_class: int) -> list[
     return shown
 
 
-def _csv(sections: list[Section]) -> str:
+def _csv(report: Report) -> str:
     """Write the rates by condition as CSV, a line each."""
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(["group", "condition", "successes", "n", "low", "high"])
-    for table in (
-        table for section in sections if section.title == conditions.TITLE for table in section.tables
-    ):
-        for condition, success, *_ in table.rows:
-            writer.writerow([table.title, condition.text, *success.value.values()])
+    for panel in report.panels:
+        for series in panel.series:
+            for condition, found in series.rates.items():
+                bounds = found.interval or (None, None)
+                writer.writerow([series.group.name, condition, found.successes, found.n, *bounds])
     return text.getvalue()

@@ -12,10 +12,19 @@ from lerobot_bomb.commands.next_steps import print_next
 from lerobot_bomb.commands.results_failures import print_failures
 from lerobot_bomb.commands.results_files import ResultsFile, read_undamaged
 from lerobot_bomb.commands.table import PROGRAM
+from lerobot_bomb.report.panels import Series
 from lerobot_bomb.results.comparison import can_compare
-from lerobot_bomb.results.groups import POLICY, Group, by_condition, differing, groups_of
-from lerobot_bomb.results.overview import differing_otherwise, rows_of, suite_of
+from lerobot_bomb.results.groups import (
+    POLICY,
+    Group,
+    by_condition,
+    differing,
+    differing_otherwise,
+    groups_of,
+    suite_of,
+)
 from lerobot_bomb.results.summary import describe_unpaired, pair_lines, summarise
+from lerobot_bomb.stats import format_p
 from lerobot_bomb.tables import print_lines, print_table, shortened
 
 LEGEND = (
@@ -53,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     for path, file in files.items():
         if args.strict and file.num_damaged:
             raise ValueError(f"{path}: damaged records, which --strict refuses: {file.num_damaged}")
-    names = _policy_names(files.values())
+    names = _policy_names(files.values()) if len(files) > 1 else {}
     told = [Groups(path, file, groups_of(file.records, names)) for path, file in files.items()]
     if args.failures:
         print_failures({each.path: (each.file.numbered, each.groups) for each in told})
@@ -83,14 +92,27 @@ def _print_rates(told: list[Groups]) -> None:
         [
             *([str(each.path)] if several else []),
             *(shortened(group.policy), suite_of(group), *(_setting(group, name) for name in apart)),
-            *row.texts(),
+            *cells,
         ]
         for each in told
         for group in each.groups
-        for row in rows_of(group)
+        for cells in _cells(Series(0, group))
     ]
     header = [*(["file"] if several else []), "policy", "suite", *apart, "condition"]
     print_table([*header, "success", "change", "p (Holm)", "n"], rows, left=(*WORDS, *apart))
+
+
+def _cells(series: Series) -> Iterator[list[str]]:
+    """Yield condition, rate, change, p and number of episodes."""
+    for condition, rate in series.rates.items():
+        change = series.costs.get(condition)
+        changed = ["", ""] if change is None else [change.describe_difference(), _p(change.p_value)]
+        yield [condition, rate.percent, *changed, str(rate.n)]
+
+
+def _p(p_value: float) -> str:
+    """Return '0.031', or '< 1e-99'."""
+    return format_p(p_value).removeprefix("p ").removeprefix("= ")
 
 
 def _setting(group: Group, name: str) -> str:
@@ -136,6 +158,13 @@ def _print_details(told: Groups) -> None:
             print(f"{path}: against the same episodes unperturbed", *against, sep="\n")
 
 
+def _are_two_to_compare(groups: list[Group]) -> bool:
+    """Return True for groups of two policies, if some differ in nothing else."""
+    if len({group.settings[POLICY] for group in groups}) != 2:
+        return False
+    return any(a.policy != b.policy and can_compare(a, b) for a, b in combinations(groups, 2))
+
+
 def _next_steps(told: list[Groups]) -> Mapping[str, str]:
     paths = shlex.join(str(each.path) for each in told)
     groups = [group for each in told for group in each.groups]
@@ -143,9 +172,7 @@ def _next_steps(told: list[Groups]) -> Mapping[str, str]:
     if number := sum(not record.is_success for group in groups for record in group.records):
         purpose = f"{number} failure{'s' * (number > 1)}, each with the command that replays it"
         steps[f"{PROGRAM} results {paths} --failures"] = purpose
-    pairs = [(a, b) for a, b in combinations(groups, 2) if can_compare(a, b)]
-    policies = {group.settings[POLICY] for group in groups}
-    if len(policies) == 2 and len(told) <= 2 and any(a.policy != b.policy for a, b in pairs):
+    if len(told) <= 2 and _are_two_to_compare(groups):
         steps[f"{PROGRAM} compare {paths}"] = "both policies on the same episodes"
     steps[f"{PROGRAM} report {paths}"] = "figures, failures and settings as one page"
     return steps

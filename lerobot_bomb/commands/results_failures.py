@@ -8,8 +8,7 @@ from lerobot_bomb.commands.next_steps import print_next
 from lerobot_bomb.environments import env_type
 from lerobot_bomb.report.report import Sample
 from lerobot_bomb.results.bomb import put_down
-from lerobot_bomb.results.groups import Group, by_condition
-from lerobot_bomb.results.overview import suite_of
+from lerobot_bomb.results.groups import Group, by_condition, suite_of
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.tables import print_table, shortened
 

@@ -27,9 +27,9 @@ Datasets and episodes
     $ --axes=camera,light --seeds=2,3
     $ --env.task=object --output=outputs/tasks
 Results
-  results: summarise files written by --env.results_path
+  results: files written by --env.results_path as one table of rates, or their failures
     $ results.jsonl
-    $ vla0_smol.jsonl fdvla.jsonl --strict
+    $ vla0_smol.jsonl fdvla.jsonl --failures
   results add: append records of LeRobot's own pusht or libero, from the output of lerobot-eval
     $ act.jsonl --policy.path=outputs/act --env.type=pusht --output_dir=outputs/eval/act
     $ results.jsonl --policy.path=me/pi05 --env.type=libero --eval.batch_size=1

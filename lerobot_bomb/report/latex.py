@@ -1,15 +1,22 @@
 """Success rates as tables for a paper, in LaTeX with the package `booktabs`."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 
-from lerobot_bomb.conditions import AxisCondition
 from lerobot_bomb.files import file_names
 from lerobot_bomb.report.cells import INTERVALS
-from lerobot_bomb.results.comparison import Comparisons, can_compare, compare
-from lerobot_bomb.results.groups import POLICY, Group, Policy, differing, groups_of, policies_of, rate_of
-from lerobot_bomb.results.overview import Row, rows_of
+from lerobot_bomb.report.panels import Panel, Series, panels_of
+from lerobot_bomb.results.comparison import Comparisons, compare
+from lerobot_bomb.results.groups import (
+    POLICY,
+    Group,
+    Policy,
+    by_condition,
+    differing,
+    groups_of,
+    policies_of,
+    rate_of,
+)
 from lerobot_bomb.results.pairs import PairedComparison, describe_test
 from lerobot_bomb.results.record import describe_numbers
 from lerobot_bomb.stats import SIGNIFICANT, Rate
@@ -26,32 +33,18 @@ MAX_BESIDE = 3  # policies in columns of their own; more stand below each other
 SMALLEST_P = 0.001
 STATED = (POLICY, "suite", "task_version")  # settings that every table says
 
-type Wins = set[tuple[str, str, AxisCondition]]  # the first group's name, which is better than the second's
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """A policy of a table, and its rows."""
-
-    group: Group
-    rows: dict[AxisCondition, Row]
-
-    @property
-    def name(self) -> str:
-        return _escaped(shortened(self.group.policy))
-
-
-type _Table = list[_Entry]
+type Wins = set[tuple[str, str, str]]  # the first group's name, which is better than the second's
 
 
 def latex_tables(groups: Sequence[Group]) -> str:
     """Write a `table` for each suite: success and its change, conditions by policies; the best in bold."""
-    tables = _tables(groups)
-    labels = file_names([_label(table[0].group) for table in tables])
-    apart = [name for name in differing([table[0].group for table in tables]) if name not in STATED]
-    wins = _wins(groups, tables)
+    panels = panels_of(groups)
+    first = [panel.series[0].group for panel in panels]
+    labels = file_names([_label(group) for group in first])
+    apart = [name for name in differing(first) if name not in STATED]
+    wins = _wins(groups, panels)
     return NEEDS + "\n".join(
-        _written(table, label, apart, wins) for table, label in zip(tables, labels, strict=True)
+        _written(panel, label, apart, wins) for panel, label in zip(panels, labels, strict=True)
     )
 
 
@@ -83,45 +76,26 @@ def _compared_line(compared: PairedComparison) -> str:
     )
 
 
-def _tables(groups: Sequence[Group]) -> list[_Table]:
-    """Split groups into those that differ in nothing but their policies."""
-    tables: list[_Table] = []
-    for group in groups:
-        entry = _Entry(group, {row.condition: row for row in rows_of(group)})
-        fits = (table for table in tables if all(_is_beside(each.group, group) for each in table))
-        if (table := next(fits, None)) is None:
-            tables.append([entry])
-        else:
-            table.append(entry)
-    return tables
-
-
-def _is_beside(group: Group, other: Group) -> bool:
-    return group.policy != other.policy and can_compare(group, other)
-
-
-def _wins(groups: Sequence[Group], tables: list[_Table]) -> Wins:
+def _wins(groups: Sequence[Group], panels: list[Panel]) -> Wins:
     """Return where a group is better than another, as `compare` tests it; of those that may be the best."""
     names = {id(record): group.name for group in groups for record in group.records}
-    leading = {policy for table in tables for policy in _leading(table)}
+    leading = {policy for panel in panels for policy in _leading(panel)}
     wins: Wins = set()
     for pair in combinations(policies_of(groups), 2):
         if not leading.isdisjoint(policy.short_name for policy in pair):
             for each in _compared(*pair):
                 better, worse = each.pairs[0] if each.counts.difference < 0 else each.pairs[0][::-1]
                 if each.is_shown:
-                    wins.add((names[id(better)], names[id(worse)], better.spec.condition))
+                    wins.add((names[id(better)], names[id(worse)], better.spec.perturbations))
     return wins
 
 
-def _leading(table: _Table) -> set[str]:
-    """Return the policies that have the highest rate under some condition."""
-    rows: dict[AxisCondition, list[Row]] = {}
-    for entry in table:
-        for condition, row in entry.rows.items():
-            rows.setdefault(condition, []).append(row)
-    best = (max(each, key=lambda row: row.rate.share) for each in rows.values() if len(each) > 1)
-    return {row.group.policy for row in best}
+def _leading(panel: Panel) -> Iterator[str]:
+    """Yield the policies that have the highest rate under some condition."""
+    for condition in panel.conditions:
+        having = [each for each in panel.series if condition in each.rates]
+        if len(having) > 1:
+            yield max(having, key=lambda each: each.rates[condition].share).policy
 
 
 def _compared(first: Policy, second: Policy) -> list[PairedComparison]:
@@ -131,48 +105,50 @@ def _compared(first: Policy, second: Policy) -> list[PairedComparison]:
         return []
 
 
-def _is_best(row: Row, table: _Table, wins: Wins) -> bool:
+def _is_best(series: Series, condition: str, panel: Panel, wins: Wins) -> bool:
     """Return True if a policy is better than every other that has the condition."""
-    others = [each.rows[row.condition] for each in table if row.condition in each.rows]
-    others = [each for each in others if each.group is not row.group]
+    others = [each for each in panel.series if each is not series and condition in each.rates]
     return bool(others) and all(
-        row.rate.share > each.rate.share and (row.group.name, each.group.name, row.condition) in wins
+        series.rates[condition].share > each.rates[condition].share
+        and (series.group.name, each.group.name, condition) in wins
         for each in others
     )
 
 
-def _written(table: _Table, label: str, apart: list[str], wins: Wins) -> str:
-    has_changes = any(row.change for entry in table for row in entry.rows.values())
-    best = {id(row) for entry in table for row in entry.rows.values() if _is_best(row, table, wins)}
+def _written(panel: Panel, label: str, apart: list[str], wins: Wins) -> str:
+    has_changes = any(each.costs for each in panel.series)
     columns = ["success", *(["change", "$p$"] if has_changes else [])]
-    conditions = list(dict.fromkeys(condition for entry in table for condition in entry.rows))
+    conditions = list(dict.fromkeys(condition for each in panel.series for condition in each.rates))
+    best = {
+        (each.group.name, condition)
+        for each in panel.series
+        for condition in each.rates
+        if _is_best(each, condition, panel, wins)
+    }
     cells = {
-        (entry.group.name, condition): _cells(entry.rows.get(condition), best, len(columns))
-        for entry in table
+        (each.group.name, condition): _cells(each, condition, best, len(columns))
+        for each in panel.series
         for condition in conditions
     }
-    write = _beside if len(table) <= MAX_BESIDE else _below
-    caption = _caption(table, apart, is_bold=bool(best))
-    return _float(caption, label, *write(table, conditions, columns, cells))
+    write = _beside if len(panel.series) <= MAX_BESIDE else _below
+    caption = _caption(panel, apart, is_bold=bool(best))
+    return _float(caption, label, *write(panel.series, conditions, columns, cells))
 
 
-type _Cells = dict[tuple[str, AxisCondition], list[str]]  # of a group's name and a condition
+type _Cells = dict[tuple[str, str], list[str]]  # of a group's name and a condition
 
 
 def _beside(
-    table: _Table, conditions: list[AxisCondition], columns: list[str], cells: _Cells
+    several: list[Series], conditions: list[str], columns: list[str], cells: _Cells
 ) -> tuple[str, list[str], list[str]]:
     """Return alignment, header and lines of a table with the policies beside each other."""
-    width = len(columns)
-    if width == 1:
-        header = [_line("condition", *(entry.name for entry in table))]
-    else:
-        header = _spanned([entry.name for entry in table], columns)
+    names, width = [*map(_name, several)], len(columns)
+    header = [_line("condition", *names)] if width == 1 else _spanned(names, columns)
     lines = [
-        _line(_escaped(condition), *(cell for entry in table for cell in cells[entry.group.name, condition]))
+        _line(_escaped(condition), *(cell for each in several for cell in cells[each.group.name, condition]))
         for condition in conditions
     ]
-    return "l" + "r" * width * len(table), header, lines
+    return "l" + "r" * width * len(several), header, lines
 
 
 def _spanned(names: list[str], columns: list[str]) -> list[str]:
@@ -185,37 +161,41 @@ def _spanned(names: list[str], columns: list[str]) -> list[str]:
 
 
 def _below(
-    table: _Table, conditions: list[AxisCondition], columns: list[str], cells: _Cells
+    several: list[Series], conditions: list[str], columns: list[str], cells: _Cells
 ) -> tuple[str, list[str], list[str]]:
     """Return alignment, header and lines of a table with the policies below each other."""
     lines: list[str] = []
     for condition in conditions:
-        having = [entry for entry in table if condition in entry.rows]
+        having = [each for each in several if condition in each.rates]
         lines += [r"\addlinespace"] if lines else []
-        for place, entry in enumerate(having):
+        for place, each in enumerate(having):
             first = "" if place else _escaped(condition)
-            lines.append(_line(first, entry.name, *cells[entry.group.name, condition]))
+            lines.append(_line(first, _name(each), *cells[each.group.name, condition]))
     return "ll" + "r" * len(columns), [_line("condition", "policy", *columns)], lines
 
 
-def _cells(row: Row | None, best: set[int], number: int) -> list[str]:
-    if row is None:
+def _name(series: Series) -> str:
+    return _escaped(shortened(series.policy))
+
+
+def _cells(series: Series, condition: str, best: set[tuple[str, str]], number: int) -> list[str]:
+    if condition not in series.rates:
         return [NOTHING] * number
-    cells = [_rate(row.rate, id(row) in best)]
-    if row.change is not None:
-        cells += [_points(row.change.counts.difference), _p(row.change.p_value)]
+    cells = [_rate(series.rates[condition], (series.group.name, condition) in best)]
+    if (change := series.costs.get(condition)) is not None:
+        cells += [_points(change.counts.difference), _p(change.p_value)]
     return cells + [NOTHING] * (number - len(cells))
 
 
-def _caption(table: _Table, apart: list[str], is_bold: bool) -> str:
-    groups = [entry.group for entry in table]
-    changes = [row.change for entry in table for row in entry.rows.values() if row.change]
+def _caption(panel: Panel, apart: list[str], is_bold: bool) -> str:
+    groups = [each.group for each in panel.series]
+    changes = [change for each in panel.series for change in each.costs.values()]
     parts = [f"{_where(groups)}."]
     if changes:
         numbers = {each.num_conditions for each in changes}
         test = describe_test(numbers.pop()) if len(numbers) == 1 else "exact McNemar test, adjusted (Holm)"
         parts.append(f"Change: in points, from the same episodes unperturbed; $p$: {_escaped(test)}.")
-    if len(table) > 1:
+    if len(groups) > 1:
         test = f"$p < {SIGNIFICANT}$, exact McNemar test on the same episodes, adjusted for conditions (Holm)"
         claim = "Bold: better" if is_bold else "Under no condition is a policy shown to be better"
         parts.append(f"{claim} than every other one ({test}).")
@@ -227,7 +207,7 @@ def _where(groups: Sequence[Group], whose: str = "") -> str:
     """Return 'Success in % on BOMB, task version 1.0, suite place: 20 episodes each, seeds ...'."""
     benchmarks = dict.fromkeys(group.records[0].benchmark() for group in groups)
     suites = dict.fromkeys(suite for group in groups if (suite := group.settings.get("suite")))
-    sizes = sorted({row.rate.n for group in groups for row in rows_of(group)})
+    sizes = sorted({len(each) for group in groups for each in by_condition(group.records).values()})
     episodes = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
     seeds = describe_numbers(each.spec.seed for group in groups for each in group.records)
     suite = f", suite {' and '.join(suites)}" if suites else ""

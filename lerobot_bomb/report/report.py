@@ -3,10 +3,13 @@
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from random import Random
 
-from lerobot_bomb.results.groups import Group
+from lerobot_bomb.report.panels import Panel, panels_of
+from lerobot_bomb.results.comparison import Comparisons, compare
+from lerobot_bomb.results.groups import Group, Policy, policies_of
 from lerobot_bomb.results.record import Record
 
 
@@ -41,6 +44,35 @@ class Report:
     groups: list[Group]
     samples: list[Sample] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)  # what files lack, or have damaged
+
+    @cached_property
+    def panels(self) -> list[Panel]:
+        """Groups side by side that compare with each other."""
+        return panels_of(self.groups)
+
+    @cached_property
+    def policies(self) -> dict[str, Policy]:
+        """Policies by name."""
+        return {each.short_name: each for each in policies_of(self.groups)}
+
+    def label(self, group: Group) -> str:
+        """Return the group's name, without the suite if all are of the same."""
+        return group.policy if len(self.panels) == 1 else group.name
+
+    def compared(self, first: str, second: str) -> Comparisons | None:
+        """Compare two policies by name; None if they have no episode in common."""
+        pair = first, second
+        if pair not in self._compared:
+            try:
+                found = compare(*(self.policies[name].records for name in pair))
+            except ValueError:  # no episode in common
+                found = None
+            self._compared[pair] = found
+        return self._compared[pair]
+
+    @cached_property
+    def _compared(self) -> dict[tuple[str, str], Comparisons | None]:
+        return {}
 
 
 def sample_failures(

@@ -172,6 +172,19 @@ def differing(groups: list[Group]) -> list[str]:
     return [name for name in names if len({group.settings.get(name) for group in groups}) > 1]
 
 
+def suite_of(group: Group) -> str:
+    """Return the suite of a group's episodes; of an environment without suites, its name."""
+    return group.settings.get("suite", group.record_type.env_type)
+
+
+def differing_otherwise(groups: Iterable[Group]) -> list[str]:
+    """Return the settings in which groups of one policy and suite differ."""
+    alike: dict[tuple[str, str], list[Group]] = {}
+    for group in groups:
+        alike.setdefault((group.settings[POLICY], suite_of(group)), []).append(group)
+    return [*{name: None for several in alike.values() for name in differing(several)}]
+
+
 def by_condition[R: Record](records: Iterable[R]) -> dict[AxisCondition, list[R]]:
     """Split a group's records by their perturbations."""
     conditions: dict[AxisCondition, list[R]] = {}

@@ -7,8 +7,8 @@ from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Section
 
 NAMES = (
-    "summary", "conditions", "axes", "sensitivity", "comparisons", "language", "failures", "samples", "board",
-    "efficiency", "published", "run", "missing",
+    "answer", "failures", "errors", "board", "samples", "axes", "map",
+    "efficiency", "comparisons", "language", "published", "run", "missing",
 )  # fmt: skip
 SECTIONS = Registry[Callable[[Report], Section]](
     "lerobot_bomb.report_sections", {name: f"{__name__}.{name}:section" for name in NAMES}
@@ -16,6 +16,6 @@ SECTIONS = Registry[Callable[[Report], Section]](
 
 
 def build(report: Report) -> list[Section]:
-    """Build the sections, without those that have neither tables nor lines."""
+    """Build the sections, without those that are empty."""
     sections = [section(report) for section in SECTIONS.values()]
-    return [section for section in sections if section.tables or section.lines]
+    return [each for each in sections if each.tables or each.lines or each.charts or each.statements]

@@ -1,5 +1,8 @@
 """Section `efficiency`: latency and cost of each policy's queries, and how smoothly it moves."""
 
+from lerobot_bomb.bootstrap import Estimate
+from lerobot_bomb.report.chart import MAX_BARS, Chart
+from lerobot_bomb.report.dots import Block, Column, Dot, dot_chart
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
 from lerobot_bomb.results.efficiency import Efficiency, efficiencies, smoothness_of
@@ -24,21 +27,58 @@ SMOOTHNESS_NOTE = (
 
 
 def section(report: Report) -> Section:
-    """Write a row of queries per group, device and size of the batch, and a row of smoothness per group."""
-    queries = [
-        [Cell(group.name), *_cells(each)] for group in report.groups for each in efficiencies(group.records)
+    """Write charts of latency and smoothness, with a row per group, device and size of the batch."""
+    found = [(report.label(group), each) for group in report.groups for each in efficiencies(group.records)]
+    measures = {report.label(group): smoothness_of(group.records) for group in report.groups}
+    smooth = {name: each for name, each in measures.items() if each}
+    charts = [_latency_chart(found)] if found else []
+    charts += [_smoothness_chart(smooth)] if smooth else []
+    return Section("Efficiency", [], charts=charts)
+
+
+def _latency_chart(found: list[tuple[str, Efficiency]]) -> Chart:
+    title = "Latency of a query, and how many passes of the network it takes"
+    table = Table(
+        "Queries", QUERIES_HEADER, [[Cell(name), *_cells(each)] for name, each in found], QUERIES_NOTE
+    )
+    shown = found[:MAX_BARS]
+    batches = {each.batch_size for _, each in shown}
+    names = [
+        name if len(batches) == 1 or each.batch_size is None else f"{name}, {each.batch_size} at once"
+        for name, each in shown
     ]
-    measures = {group.name: smoothness_of(group.records) for group in report.groups}
-    smooth = [
+    latency = [Dot(each.latency_p50_ms, each.latency_p50_ms, each.latency_p95_ms) for _, each in shown]
+    columns = [
+        Column(
+            "latency, ms: p50 to p95",
+            {0: [*latency]},
+            (0, 1.05 * max(each.latency_p95_ms for _, each in shown)),
+        )
+    ]
+    passes = [None if each.passes is None else Dot(each.passes, None, None) for _, each in shown]
+    if any(passes):
+        columns.append(Column("passes per query", {0: passes}))
+    note = "Device: " + ", ".join(dict.fromkeys(each.device for _, each in shown)) + "."
+    return Chart(title, dot_chart(title, [""], [Block("", names, columns)]), [table], note)
+
+
+def _smoothness_chart(smooth: dict[str, dict[str, Estimate]]) -> Chart:
+    title = "Smoothness of the executed actions; less is smoother"
+    rows = [
         [Cell(name), *(Cell(str(found[each]), vars(found[each])) for each in SMOOTHNESS)]
-        for name, found in measures.items()
-        if found
+        for name, found in smooth.items()
     ]
-    tables = [
-        Table("Queries", QUERIES_HEADER, queries, QUERIES_NOTE),
-        Table("Smoothness", ["policy, suite", *SMOOTHNESS], smooth, SMOOTHNESS_NOTE),
+    table = Table("Smoothness", ["policy, suite", *SMOOTHNESS], rows, SMOOTHNESS_NOTE)
+    shown = dict(list(smooth.items())[:MAX_BARS])
+    columns = [
+        Column(f"{name}, per step", {0: [_dot(found[name]) for found in shown.values()]})
+        for name in SMOOTHNESS
     ]
-    return Section("Efficiency", [table for table in tables if table.rows])
+    return Chart(title, dot_chart(title, [""], [Block("", list(shown), columns)]), [table])
+
+
+def _dot(estimate: Estimate) -> Dot:
+    return Dot(estimate.mean, estimate.low, estimate.high)
 
 
 def is_measured(report: Report) -> bool:

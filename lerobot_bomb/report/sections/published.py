@@ -95,7 +95,7 @@ def section(report: Report) -> Section:
     """Write the section: published success rates on each environment's task, and speeds."""
     tasks = dict.fromkeys(group.record_type.env_type.removeprefix("bomb_") for group in report.groups)
     tables = [_table(f"Success: {each}", SUCCESS[each], NOTES[each]) for each in tasks if each in SUCCESS]
-    return Section(TITLE, [*tables, _table("Speed", SPEED, SPEED_NOTE)])
+    return Section(TITLE, [*tables, _table("Speed", SPEED, SPEED_NOTE)], is_folded=True)
 
 
 def _table(title: str, figures: tuple[Figure, ...], note: str) -> Table:

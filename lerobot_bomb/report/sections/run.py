@@ -12,7 +12,7 @@ from lerobot_bomb.results.record import Record
 def section(report: Report) -> Section:
     """Write the section: lines of each group."""
     lines = [line for group in report.groups for line in (group.name, *commands(group))]
-    return Section("What was run", [], lines)
+    return Section("What was run", [], lines, is_folded=True)
 
 
 def commands(group: Group) -> list[str]:

@@ -1,18 +1,11 @@
-"""Section `sensitivity`: how much each axis matters."""
+"""Sensitivity to the axes: how much success each of them costs."""
 
 import numpy as np
 
 from lerobot_bomb.bootstrap import Slope, fit_slope, variance_share
-from lerobot_bomb.report.report import Report
-from lerobot_bomb.report.table import Cell, Section, Table
+from lerobot_bomb.report.table import Cell, Table
 from lerobot_bomb.results.groups import Group
 from lerobot_bomb.results.record import Record
-
-
-def section(report: Report) -> Section:
-    """Write the section: a table for each group that has several levels of an axis."""
-    tables = [table for group in report.groups if (table := sensitivity(group))]
-    return Section("Sensitivity to an axis", tables)
 
 
 def sensitivity(group: Group) -> Table | None:
@@ -36,7 +29,7 @@ def sensitivity(group: Group) -> Table | None:
         "Share: of the variance of success where the levels of several axes were drawn, what this axis "
         "explains alone (epsilon squared: 0 on average where it has no effect)."
     )
-    return Table(group.name, ["axis", "points per level", "share of variance"], table, note)
+    return Table(f"Sensitivity: {group.name}", ["axis", "points per level", "share of variance"], table, note)
 
 
 def _slopes(group: Group) -> dict[str, Slope]:

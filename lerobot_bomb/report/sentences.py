@@ -1,0 +1,232 @@
+"""Sentences that say what the numbers say, and no more than their number of episodes allows."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import combinations
+
+from lerobot_bomb.conditions import NONE, AxisCondition
+from lerobot_bomb.report.chart import cut
+from lerobot_bomb.report.panels import Panel, Series
+from lerobot_bomb.report.table import Statement
+from lerobot_bomb.results.comparison import Comparisons
+from lerobot_bomb.results.groups import rate_of, settings_of
+from lerobot_bomb.results.pairs import PairedComparison
+from lerobot_bomb.stats import SIGNIFICANT, Rate, format_p
+
+MAX_NAMED = 3  # names in a sentence
+MAX_PLACES = 6  # of a ranking
+
+
+def describe_series(series: Series, panel: Panel) -> Statement:
+    """Say how often a policy succeeds, what it loses most to, and what is not known."""
+    suite = f" on {panel.name}" if panel.name else ""
+    nominal = series.rates.get(NONE)
+    if nominal is not None:
+        text = f"succeeds in {in_words(nominal)} unperturbed episodes{suite}"
+    elif series.perturbed is not None:
+        text = (
+            f"has no unperturbed episodes{suite}; it succeeds in {in_words(series.perturbed)} perturbed ones"
+        )
+    else:
+        text = ""
+    if nominal is not None and series.perturbed is not None:
+        text += f", {_perturbed(series, series.perturbed)}"
+    return Statement(series.policy, " ".join([f"{text}.", *_costs(series)]))
+
+
+def in_words(rate: Rate) -> str:
+    """Return '198 of 200 (99 % [96, 100])'."""
+    return f"{rate.successes} of {rate.n} ({percent(rate)})"
+
+
+def percent(rate: Rate) -> str:
+    """Return '99 % [96, 100]'; '99 %' without an interval."""
+    bounds = "" if rate.interval is None else f" [{100 * rate.interval[0]:.0f}, {100 * rate.interval[1]:.0f}]"
+    return f"{100 * rate.share:.0f} %{bounds}"
+
+
+def _perturbed(series: Series, pooled: Rate) -> str:
+    """Return the rate under the widest condition, or under all perturbed ones."""
+    widest = widest_condition(series)
+    if widest is None:
+        number = len(series.rates) - 1
+        return f"and in {in_words(pooled)} over {number} perturbed condition{'s' * (number > 1)}"
+    cost = series.costs.get(widest)
+    return f"and in {in_words(series.rates[widest])} under {widest}{_change(cost) if cost else ''}"
+
+
+def widest_condition(series: Series) -> AxisCondition | None:
+    """Return the condition with the most axes, then the highest levels; None if none has several axes."""
+    several = [each for each in series.records if len(each.ranges) > 1]
+    return max(
+        several, key=lambda each: (len(each.ranges), sum(high for *_, high in each.ranges)), default=None
+    )
+
+
+def _change(compared: PairedComparison) -> str:
+    """Return ', 16 points less (p = 0.002)'."""
+    test = format_p(compared.p_value)
+    if compared.p_value < SIGNIFICANT:
+        return f", {_points(compared)} ({test})"
+    return f" (no difference shown: {_points(compared)}, {test})"
+
+
+def _points(compared: PairedComparison) -> str:
+    points = 100 * compared.counts.difference
+    if points == 0:
+        return "no change"
+    return f"{abs(points):.0f} points {'less' if points < 0 else 'more'}"
+
+
+def _costs(series: Series) -> Iterator[str]:
+    """Yield sentences on what each condition costs beside the widest."""
+    if not series.costs:
+        if series.perturbed is not None:
+            yield "What a condition costs is not known: no perturbed episode was also run unperturbed."
+        return
+    widest = widest_condition(series)
+    of_axes = _worst_of_axes(series.costs.values(), () if widest is None else axes_of_condition(widest))
+    shown = [each for each in of_axes if each.p_value < SIGNIFICANT]
+    lost = [each for each in shown if each.counts.difference < 0]
+    won = [each for each in shown if each.counts.difference > 0]
+    if lost:
+        yield f"It loses most to {_named(lost)}."
+    if won:
+        yield f"It gains from {_named(won[::-1])}."
+    others = [each for each in of_axes if each.p_value >= SIGNIFICANT]
+    if others:
+        yield _no_difference(others, "other " if shown else "single " if widest else "")
+
+
+def axes_of_condition(condition: AxisCondition) -> tuple[str, ...]:
+    """Return the axes that a condition turns on."""
+    return tuple(axis for axis, _, _ in condition.ranges)
+
+
+def _worst_of_axes(costs: Iterable[PairedComparison], but: tuple[str, ...]) -> list[PairedComparison]:
+    """Return one comparison for each set of axes but one: the largest loss that is shown, if any is."""
+    by_axes: dict[tuple[str, ...], PairedComparison] = {}
+    for each in costs:
+        axes = axes_of_condition(each.pairs[0][1].spec.condition)
+        known = by_axes.get(axes)
+        if axes != but and (known is None or _strength(each) < _strength(known)):
+            by_axes[axes] = each
+    return sorted(by_axes.values(), key=lambda each: each.counts.difference)
+
+
+def _strength(compared: PairedComparison) -> tuple[bool, float]:
+    return compared.p_value >= SIGNIFICANT, compared.counts.difference
+
+
+def _named(costs: Sequence[PairedComparison]) -> str:
+    """Return 'camera:3, 40 points less (p = 0.001), and light:3, ...'."""
+    names = [f"{each.condition} ({_points(each)}, {format_p(each.p_value)})" for each in costs]
+    return in_a_row(_some(names))
+
+
+def in_a_row(names: Sequence[str]) -> str:
+    """Return 'a, b and c'."""
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def _no_difference(others: Sequence[PairedComparison], kind: str) -> str:
+    """Say that conditions show no difference, and how many episodes the largest would take."""
+    if len(others) == 1:
+        subject = f"{others[0].condition} shows no difference"
+    else:
+        are_single = all(len(each.pairs[0][1].spec.condition.ranges) == 1 for each in others)
+        subject = f"No {kind}{'axis' if are_single else 'condition'} shows a difference"
+    needed = [(number, each) for each in others if (number := each.num_needed)]
+    if not needed:
+        return f"{subject}."
+    number, largest = min(needed, key=lambda found: found[0])
+    name = "that" if len(others) == 1 else f"the largest, {largest.condition}"
+    return f"{subject}; about {number:,} {_unit(largest)} would show {name} ({_points(largest)})."
+
+
+def _unit(compared: PairedComparison) -> str:
+    return "seeds" if compared.num_starts == len(compared.pairs) else "pairs of episodes"
+
+
+def describe_ranking(panel: Panel) -> Iterator[Statement]:
+    """Say on which episodes policies are ranked, with their rates there, and why not where they are not."""
+    kind, records = panel.shared
+    suite = f" on {panel.name}" if panel.name else ""
+    if not records:
+        yield Statement(f"No ranking{suite}:", f"{_why_not_ranked(panel)}.")
+        return
+    rates = {each.policy: rate_of(shared) for each, shared in zip(panel.series, records, strict=True)}
+    tied: dict[float, list[str]] = {}
+    for each in panel.ranked:
+        tied.setdefault(rates[each.policy].share, []).append(cut(each.policy))
+    places = [
+        f"{in_a_row(_some(names))} {'tie at ' if len(names) > 1 else ''}{100 * share:.0f} %"
+        for share, names in tied.items()
+    ]
+    number = len(records[0])
+    episodes = f"{number} {kind}episodes" if number > 1 else f"one {kind}episode"
+    told = ", ".join(_some(places, MAX_PLACES))
+    yield Statement(f"Ranking{suite}", f"by the {episodes} that all policies have: {told}.")
+
+
+def _why_not_ranked(panel: Panel) -> str:
+    """Name the first two policies that have no episode in common."""
+    specs = {each.policy: {record.spec for record in each.group.records} for each in panel.series}
+    for first, second in combinations(specs, 2):
+        if specs[first].isdisjoint(specs[second]):
+            return f"{cut(first)} and {cut(second)} have no episode in common"
+    return "no episode was run by all policies, though each two of them have some in common"
+
+
+def _some(names: Sequence[str], most: int = MAX_NAMED) -> list[str]:
+    """Return the first names, and how many more there are."""
+    more = len(names) - most
+    return [*names[:most]] + ([f"{more} more"] if more > 0 else [])
+
+
+def describe_comparison(first: Series, second: Series, compared: Comparisons) -> Statement:
+    """Say which of two policies of a panel is better, and under which conditions."""
+    found = [each for each in compared.conditions if _is_of(each, first)]
+    nominal = [each for each in found if each.pairs[0][0].spec.perturbations == NONE]
+    others = [each for each in found if each.pairs[0][0].spec.perturbations != NONE]
+    names = cut(first.policy), cut(second.policy)
+    parts = [_verdict(each, *names) for each in nominal]
+    if others:
+        parts.append(_perturbed_verdict(others, *names))
+    return Statement(f"{names[0]} against {names[1]}:", " ".join(parts) or "no episode of both.")
+
+
+def _is_of(compared: PairedComparison, series: Series) -> bool:
+    return settings_of(compared.pairs[0][0]) == series.group.settings
+
+
+def _verdict(compared: PairedComparison, first: str, second: str) -> str:
+    """Return 'unperturbed, act is better by 28 points [12, 43] (40 pairs, p = 0.0068).'."""
+    counts, number = compared.counts, f"{compared.counts.n} pairs"
+    if counts.difference == 0:
+        return f"unperturbed, they tie ({counts.first} successes each in {number})."
+    low, high = compared.interval
+    better, low, high = (first, -high, -low) if counts.difference < 0 else (second, low, high)
+    points = f"{100 * abs(counts.difference):.0f} points [{100 * low:.0f}, {100 * high:.0f}]"
+    if compared.p_value < SIGNIFICANT:
+        return f"unperturbed, {better} is better by {points} ({number}, {format_p(compared.p_value)})."
+    needed = f"; about {compared.num_needed:,} pairs would show it" if compared.num_needed else ""
+    test = f"{number}, {format_p(compared.p_value)}"
+    return f"unperturbed, no difference is shown: {better} has {points} more ({test}{needed})."
+
+
+def _perturbed_verdict(found: Sequence[PairedComparison], first: str, second: str) -> str:
+    """Say under how many perturbed conditions each is better."""
+    shown = [each for each in found if each.p_value < SIGNIFICANT]
+    parts = []
+    for name, sign in ((first, -1), (second, 1)):
+        better = [each for each in shown if sign * each.counts.difference > 0]
+        if better:
+            most = max(better, key=lambda each: sign * each.counts.difference)
+            condition = most.pairs[0][0].spec.perturbations
+            points = 100 * abs(most.counts.difference)
+            parts.append(
+                f"{name} is better under {len(better)}, most under {condition} (by {points:.0f} points)"
+            )
+    told = in_a_row(parts) if parts else "none shows a difference"
+    number = f"{len(found)} perturbed conditions" if len(found) > 1 else "the one perturbed condition"
+    return f"Of {number}, {told}."
