@@ -95,7 +95,7 @@ def test_the_best_is_bold_where_it_is_shown_to_be_better_than_every_other(tmp_pa
     third = PolicyIdentity("third", None)
     path = tmp_path / "r.jsonl"
     for policy, failures in {
-        # 20 pairs: 0 against 8 and against 12 is shown, 5 against 0 is not, 20 against 20 is a tie
+        # failures of 20: 0 against 12 and 14 is shown, 0 against 5 is not, 20 against 20 is a tie
         FDVLA: {"none": 0, "light:3": 0, "camera:3": 20},
         PolicyIdentity("act"): {"none": 12, "light:3": 5, "camera:3": 20},
         third: {"none": 14, "light:3": 20, "camera:3": 20},

@@ -35,8 +35,8 @@ WORDS = ("policy", "suite", "condition")  # columns at the left
 
 
 @dataclass(frozen=True)
-class Groups:
-    """Groups of the records of a file."""
+class FileGroups:
+    """A results file, and the groups of its records."""
 
     path: Path
     file: ResultsFile
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         if args.strict and file.num_damaged:
             raise ValueError(f"{path}: damaged records, which --strict refuses: {file.num_damaged}")
     names = _policy_names(files.values()) if len(files) > 1 else {}
-    told = [Groups(path, file, groups_of(file.records, names)) for path, file in files.items()]
+    told = [FileGroups(path, file, groups_of(file.records, names)) for path, file in files.items()]
     if args.failures:
         print_failures({each.path: (each.file.numbered, each.groups) for each in told})
         return 0
@@ -84,7 +84,7 @@ def _policy_names(files: Iterable[ResultsFile]) -> dict[str, str]:
     return {group.settings[POLICY]: group.policy for group in groups_of(records)}
 
 
-def _print_rates(told: list[Groups]) -> None:
+def _print_rates(told: list[FileGroups]) -> None:
     """Print a line for each group and condition."""
     several = len(told) > 1
     apart = [*{name: None for each in told for name in differing_otherwise(each.groups)}]
@@ -121,7 +121,7 @@ def _setting(group: Group, name: str) -> str:
     return group.settings.get(name, "")
 
 
-def _notes(told: list[Groups]) -> Iterator[str]:
+def _notes(told: list[FileGroups]) -> Iterator[str]:
     """Yield what is damaged, not compared, or kept apart."""
     for each in told:
         if each.file.num_damaged:
@@ -133,7 +133,7 @@ def _notes(told: list[Groups]) -> Iterator[str]:
                 yield f"{each.path}: {group.name}: {unpaired}"
 
 
-def _print_details(told: Groups) -> None:
+def _print_details(told: FileGroups) -> None:
     """Print each group's heading, and the measures under each condition."""
     path = told.path
     if len(told.groups) > 1:
@@ -165,7 +165,7 @@ def _are_two_to_compare(groups: list[Group]) -> bool:
     return any(a.policy != b.policy and can_compare(a, b) for a, b in combinations(groups, 2))
 
 
-def _next_steps(told: list[Groups]) -> Mapping[str, str]:
+def _next_steps(told: list[FileGroups]) -> Mapping[str, str]:
     paths = shlex.join(str(each.path) for each in told)
     groups = [group for each in told for group in each.groups]
     steps: dict[str, str] = {}
