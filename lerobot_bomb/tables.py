@@ -25,7 +25,7 @@ def print_lines(*lines: str) -> None:
 
 def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], left: Collection[str] = ()) -> None:
     """Print rows of text, the first column and those named in `left` to the left, the others to the right."""
-    aligned = [str.ljust if name in (header[0], *left) else str.rjust for name in header]
+    aligned = [str.rjust if place and name not in left else str.ljust for place, name in enumerate(header)]
     header, rows = [*map(printable, header)], [[*map(printable, row)] for row in rows]
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     for row in [header, *rows]:
