@@ -72,7 +72,7 @@ def test_the_table_has_a_line_for_each_condition_and_a_column_for_each_policy(ex
     lines = (exported / "table.tex").read_text().splitlines()
     body = [line.removesuffix(r" \\").split(" & ") for line in lines if line.endswith(r"\\")]
     header, *conditions = body
-    assert header[0] == "condition" and [name.split()[0] for name in header[1:]] == ["act", "fdvla"]
+    assert header[0] == "condition" and header[1:] == ["act, place", "fdvla, place"]
     assert [row[0] for row in conditions] == ["none", "all:1-5"]
     for row in conditions:
         shares = [int(re.match(r"\d+", cell)[0]) for cell in row[1:]]  # pyright: ignore

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from html import escape
 
-from lerobot_bomb.report.chart import Chart, cut
+from lerobot_bomb.report.chart import Chart, shorten
 from lerobot_bomb.report.table import Cell, Section, Statement, Table
 
 # one hue in different strengths, which reads the same for the colour-blind
@@ -11,6 +11,7 @@ SHADE = "background:rgba(0,114,178,{:.2f})"
 MAX_STRENGTH = 0.55  # text stays readable on it, black or white
 MAX_UNBROKEN = 24  # characters of a cell that stay in one line, even where the table is too wide
 MAX_TEXT = 240  # characters of a name or cell that are shown; the rest is shown under the pointer
+MAX_SUBJECT = 60  # characters of the subject of a sentence
 MAX_HOVER = 6000  # characters shown under the pointer
 MAX_ROWS = 200  # of a table that the page shows; the files beside it have all
 STYLE = """
@@ -27,7 +28,7 @@ td.long{white-space:normal;overflow-wrap:anywhere;min-width:9rem}
 p.note{opacity:.75;max-width:60rem;font-size:.9rem}
 figure{margin:1rem 0}figure img{image-rendering:pixelated;margin-right:.3rem}
 figcaption{font-weight:600;font-size:1rem}
-figure svg{display:block;max-width:100%;min-width:34rem;height:auto}
+figure svg{display:block;max-width:100%;height:auto}
 figure svg *{stroke-linejoin:round;stroke-linecap:butt}
 p.statement{max-width:60rem;margin:.5rem 0}
 h1,h2,h3,b,summary{overflow-wrap:anywhere}
@@ -46,7 +47,7 @@ def render(title: str, sections: Sequence[Section]) -> str:
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(cut(title, MAX_TEXT))}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"<title>{escape(shorten(title, MAX_TEXT))}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
         f"{heading}\n<nav>{links}</nav>\n{body}\n</body>\n</html>\n"
     )
 
@@ -65,7 +66,9 @@ def _section(section: Section) -> str:
 
 
 def _statement(statement: Statement) -> str:
-    return f'<p class="statement"><b>{_shown(statement.subject)}</b> {escape(statement.text)}</p>'
+    return (
+        f'<p class="statement"><b>{_shown(statement.subject, MAX_SUBJECT)}</b> {escape(statement.text)}</p>'
+    )
 
 
 def _chart(chart: Chart) -> str:
@@ -88,11 +91,11 @@ def _tables(tables: Sequence[Table]) -> list[str]:
     return parts
 
 
-def _shown(text: str) -> str:
+def _shown(text: str, most: int = MAX_TEXT) -> str:
     """Escape a text; of a very long one, show the ends, and the rest under the pointer."""
-    if len(text) <= MAX_TEXT:
+    if len(text) <= most:
         return escape(text)
-    return f'<span title="{escape(text[:MAX_HOVER])}">{escape(cut(text, MAX_TEXT))}</span>'
+    return f'<span title="{escape(text[:MAX_HOVER])}">{escape(shorten(text, most))}</span>'
 
 
 def _table(table: Table, note: str) -> str:

@@ -94,8 +94,9 @@ class Panel:
         if not number:
             return ""
         return (
-            f"Shown: {len(self.shown_conditions)} of {len(self.conditions)} conditions, of each set of axes "
-            f"the highest levels, those with the largest loss first; the other {number} are in the numbers."
+            f"Shown: {len(self.shown_conditions)} of {len(self.conditions):,} conditions, of each set of axes "
+            "the highest levels, those with the largest loss first; "
+            f"the other {number:,} are in the numbers."
         )
 
     @cached_property
