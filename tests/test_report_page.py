@@ -56,7 +56,7 @@ def test_a_long_table_is_cut_and_says_so() -> None:
 
 def test_names_are_shortened_in_their_middle() -> None:
     assert shorten("a" * MAX_NAME) == "a" * MAX_NAME
-    assert shorten("begin" + "x" * 100 + "end", 10) == "beginx…end"
+    assert shorten("begin" + "x" * 100 + "end", 10) == "begin…xend"
     assert len(shorten("x" * 5000)) == MAX_NAME
     assert chart_text("a$b\nc") == r"a\$b\nc"
 

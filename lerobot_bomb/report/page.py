@@ -48,7 +48,7 @@ def render(title: str, sections: Sequence[Section]) -> str:
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(shorten(title, MAX_TEXT))}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        f"{heading}\n<nav>{links}</nav>\n{body}\n</body>\n</html>\n"
+        f"{heading}\n<nav>{links}</nav>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
     )
 
 
@@ -75,7 +75,7 @@ def _chart(chart: Chart) -> str:
     caption = f"<figcaption>{_shown(chart.title)}</figcaption>"
     note = f'<p class="note">{escape(chart.note)}</p>' if chart.note else ""
     numbers = _folded("The numbers", _tables(chart.tables)) if chart.tables else ""
-    return f'<figure>{caption}\n<div class="wide">{chart.svg}</div>{note}{numbers}</figure>'
+    return f'<figure>{caption}\n<div class="wide" tabindex="0">{chart.svg}</div>{note}{numbers}</figure>'
 
 
 def _folded(title: str, parts: list[str]) -> str:
@@ -109,7 +109,7 @@ def _table(table: Table, note: str) -> str:
     notes += [f"{left:,} more rows are in the JSON file beside this page."] if left > 0 else []
     below = "".join(f'\n<p class="note">{escape(each)}</p>' for each in notes)
     grid = f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
-    return f'{title}<div class="wide">{grid}</div>{below}'
+    return f'{title}<div class="wide" tabindex="0">{grid}</div>{below}'
 
 
 def _is_text(table: Table, column: int) -> bool:

@@ -121,7 +121,7 @@ def _strength(compared: PairedComparison) -> tuple[bool, float]:
 
 
 def _named(costs: Sequence[PairedComparison]) -> str:
-    """Return 'camera:3, 40 points less (p = 0.001), and light:3, ...'."""
+    """Return 'camera:3 (40 points less, p = 0.001) and light:3 (...)'."""
     names = [f"{each.condition} ({_points(each)}, {format_p(each.p_value)})" for each in costs]
     return in_a_row(_some(names))
 
@@ -138,7 +138,8 @@ def _no_difference(others: Sequence[PairedComparison], kind: str) -> str:
     else:
         are_single = all(len(each.pairs[0][1].spec.condition.ranges) == 1 for each in others)
         subject = f"No {kind}{'axis' if are_single else 'condition'} shows a difference"
-    needed = [(number, each) for each in others if (number := each.num_needed)]
+    likely = sorted(others, key=lambda each: each.counts.p_value)[:MAX_NAMED]
+    needed = [(number, each) for each in likely if (number := each.num_needed)]
     if not needed:
         return f"{subject}."
     number, largest = min(needed, key=lambda found: found[0])

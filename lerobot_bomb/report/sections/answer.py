@@ -42,9 +42,10 @@ def _statements(report: Report, panel: Panel) -> list[Statement]:
     told = panel.ranked[:MAX_TOLD]
     found = list(describe_ranking(panel)) if len(panel.series) > 1 else []
     for other in told[1:]:
-        compared = report.compared(told[0].policy, other.policy)
+        first, second = sorted((told[0], other), key=lambda each: each.place)
+        compared = report.compared(first.policy, second.policy)
         if compared is not None:
-            found.append(describe_comparison(told[0], other, compared))
+            found.append(describe_comparison(first, second, compared))
     return found + [describe_series(each, panel) for each in told]
 
 
