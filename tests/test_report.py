@@ -140,6 +140,16 @@ def test_the_distribution_of_errors_is_that_of_the_lines(rows: Rows, written: Pa
     assert len(table["rows"]) == 4
 
 
+def test_the_map_is_that_of_the_lines(rows: Rows, written: Path) -> None:
+    (table,) = tables(written, "Every policy under every condition")
+    names = ["none" if name == "unperturbed" else name for name in table["header"][1:]]
+    assert sorted(names) == ["camera:2", "camera:4", "none"] and names[0] == "none"
+    for policy, *shares in table["rows"]:
+        for condition, share in zip(names, shares, strict=True):
+            episodes = recount(rows, policy, condition)
+            assert share == sum(row["is_success"] for row in episodes) / 12
+
+
 def test_two_policies_are_compared_on_their_common_episodes(rows: Rows, written: Path) -> None:
     (table,) = tables(written, "Two policies on the same episodes")
     for condition, first, second, difference, _, pairs in table["rows"]:

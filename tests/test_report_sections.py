@@ -12,6 +12,7 @@ import av
 import pytest
 from result_rows import ACT, FDVLA, values
 
+from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.checkpoints.names import REPLACE_TASKS
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.commands.report import NUM_SAMPLES
@@ -136,7 +137,8 @@ def test_policies_are_ranked_on_the_episodes_that_all_have(report: Callable[...,
     assert section["statements"][:2] == [
         "Ranking on place by the 2 unperturbed episodes that all policies have: act 100 %, fdvla 50 %.",
         "act against fdvla: unperturbed, no difference is shown: act has 50 points [-27, 91] more (2 pairs, "
-        "p = 1; about 17 pairs would show it). Of the one perturbed condition, none shows a difference.",
+        "p = 1; about 17 pairs would show it). Under camera:3, no difference is shown: act has 50 points "
+        "[-27, 91] more (2 pairs, p = 1; about 17 pairs would show it).",
     ]
     assert section["lines"] == [
         "act, place: 5 of its 9 episodes were not run by all policies; pairs and ranking leave them out",
@@ -197,6 +199,36 @@ def test_a_name_that_is_given_stands_everywhere(
         with pytest.raises(SystemExit, match="2"):
             main(["report", path, f"--names={wrong}"])
         assert "must be POLICY=NAME, several joined by commas" in capsys.readouterr().err
+
+
+def test_many_policies_and_conditions_are_ranked_and_the_rest_is_counted(
+    report: Callable[..., dict[str, Any]], tmp_path: Path
+) -> None:
+    pairs = [f"{axis}:{level}+start:{level}" for axis in ("camera", "light", "table") for level in (1, 2, 3)]
+    singles = [f"{axis}:{level}" for axis in ("camera", "light", "table", "object") for level in range(1, 6)]
+    policies = [PolicyIdentity("act", f"outputs/run_{number}/last") for number in range(8)]
+    rows = [
+        row
+        for number, policy in enumerate(policies)
+        for row in perturbed(dict.fromkeys(["none", *singles, *pairs], outcomes(number > 2, 1)), policy)
+    ]
+    sections = report(rows)
+    assert (
+        "<h1>8 policies on bomb (place): 240 episodes, 30 conditions</h1>"
+        in (tmp_path / "out" / "r.html").read_text()
+    )
+    (chart,) = sections["Success"]["charts"]
+    assert chart["title"] == "Success by policy, unperturbed and perturbed" and len(chart["tables"]) == 9
+    assert sections["Success"]["statements"][0] == (
+        "Ranking on place by the one unperturbed episode that all policies have: act run_3, act run_4, "
+        "act run_5 and 2 more tie at 100 %, act run_0, act run_1 and act run_2 tie at 0 %."
+    )
+    (chart,) = sections["Every policy under every condition"]["charts"]
+    (table,) = chart["tables"]
+    shown = {"unperturbed", "camera:5", "light:5", "table:5", "object:5"}
+    assert {*table["header"][1:]} == shown | {str(Condition(each)) for each in pairs if each.endswith(":3")}
+    assert "Shown: 8 of 30 conditions" in chart["note"]
+    assert [row[0] for row in table["rows"]][:5] == [f"act run_{number}" for number in range(3, 8)]
 
 
 # Levels of axes

@@ -76,11 +76,11 @@ def _inline(svg: str, title: str, size: tuple[float, float]) -> str:
     pixels = round(96 * size[0])
     return (
         f'<svg role="img" viewBox="0 0 {width:g} {height:g}" '
-        f'style="width:{pixels}px"><title>{escape(title)}</title>{body}'
+        f'style="width:{pixels}px;min-width:min(46rem,{pixels}px)"><title>{escape(title)}</title>{body}'
     )
 
 
-def cut(name: str, most: int = MAX_NAME) -> str:
+def shorten(name: str, most: int = MAX_NAME) -> str:
     """Return a name of at most so many characters, without its middle if it is longer."""
     if len(name) <= most:
         return name
@@ -88,9 +88,9 @@ def cut(name: str, most: int = MAX_NAME) -> str:
     return f"{name[: most - 1 - last]}…{name[-last:]}"
 
 
-def plain(name: str) -> str:
-    """Return a name for matplotlib, which takes `$` for mathematics; cut."""
-    return cut(printable(name)).replace("$", r"\$")
+def chart_text(name: str) -> str:
+    """Return a name for matplotlib, which takes `$` for mathematics; shortened."""
+    return shorten(printable(name)).replace("$", r"\$")
 
 
 def tidy(axes: "Axes", grid: str = "x") -> None:

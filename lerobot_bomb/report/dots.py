@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from lerobot_bomb.report.chart import COLORS, INK, MARKERS, WIDTH, draw, plain, tidy
+from lerobot_bomb.report.chart import COLORS, INK, MARKERS, WIDTH, chart_text, draw, tidy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,7 +27,7 @@ class Dot:
 
 
 @dataclass(frozen=True)
-class Column:
+class DotColumn:
     """One quantity of every row: {series: a dot for each row, or none}."""
 
     label: str
@@ -42,7 +42,7 @@ class Block:
 
     title: str
     rows: list[str]
-    columns: list[Column]
+    columns: list[DotColumn]
 
 
 def dot_chart(title: str, series: Sequence[str], blocks: Sequence[Block]) -> str:
@@ -75,10 +75,10 @@ def add_legend(figure: "Figure", series: Sequence[str]) -> None:
         Line2D([], [], color=COLORS[i % len(COLORS)], marker=MARKERS[i % len(MARKERS)], linestyle="-")
         for i in range(len(series))
     ]
-    figure.legend(handles, [*map(plain, series)], loc="outside upper left", ncols=3)
+    figure.legend(handles, [*map(chart_text, series)], loc="outside upper left", ncols=3)
 
 
-def _paint_column(axes: "Axes", block: Block, column: Column, num_series: int, has_names: bool) -> None:
+def _paint_column(axes: "Axes", block: Block, column: DotColumn, num_series: int, has_names: bool) -> None:
     from matplotlib.ticker import MaxNLocator
 
     height = 0.8 / max(num_series, 1)
@@ -87,7 +87,7 @@ def _paint_column(axes: "Axes", block: Block, column: Column, num_series: int, h
         for row, dot in enumerate(dots):
             if dot is not None:
                 _paint_dot(axes, dot, row + shift, number)
-    names = [*map(plain, block.rows)] if has_names else [""] * len(block.rows)
+    names = [*map(chart_text, block.rows)] if has_names else [""] * len(block.rows)
     axes.set_yticks(range(len(block.rows)), names)
     axes.set_ylim(len(block.rows) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
@@ -101,7 +101,7 @@ def _paint_column(axes: "Axes", block: Block, column: Column, num_series: int, h
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.set_xlabel(column.label)
     if has_names and block.title:
-        axes.set_title(plain(block.title), loc="left", fontweight="bold")
+        axes.set_title(chart_text(block.title), loc="left", fontweight="bold")
     tidy(axes)
 
 

@@ -90,12 +90,12 @@ class Panel:
     @property
     def left_out(self) -> str:
         """Sentence on the conditions that charts do not show; '' if they show all."""
-        number = len(self.conditions) - len(self.shown_conditions)
-        if not number:
+        shown, total = len(self.shown_conditions), len(self.conditions)
+        if shown == total:
             return ""
         return (
-            f"Shown: {len(self.shown_conditions)} of {len(self.conditions)} conditions, of each set of axes "
-            f"the highest levels, those with the largest loss first; the other {number} are in the numbers."
+            f"Shown: {shown} of {total:,} conditions, of each set of axes the highest levels, those with the "
+            f"largest loss first; the other {total - shown:,} are in the numbers."
         )
 
     @cached_property

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations
 
 from lerobot_bomb.conditions import NONE, AxisCondition
-from lerobot_bomb.report.chart import cut
+from lerobot_bomb.report.chart import shorten
 from lerobot_bomb.report.panels import Panel, Series
 from lerobot_bomb.report.table import Statement
 from lerobot_bomb.results.comparison import Comparisons
@@ -48,15 +48,18 @@ def _perturbed(series: Series, pooled: Rate) -> str:
     """Return the rate under the widest condition, or under all perturbed ones."""
     widest = widest_condition(series)
     if widest is None:
-        number = len(series.rates) - 1
-        return f"and in {in_words(pooled)} over {number} perturbed condition{'s' * (number > 1)}"
+        return f"and in {in_words(pooled)} over {len(series.rates) - 1} perturbed conditions"
     cost = series.costs.get(widest)
     return f"and in {in_words(series.rates[widest])} under {widest}{_change(cost) if cost else ''}"
 
 
 def widest_condition(series: Series) -> AxisCondition | None:
-    """Return the condition with the most axes, then the highest levels; None if none has several axes."""
-    several = [each for each in series.records if len(each.ranges) > 1]
+    """Return the condition with the most axes, then the highest levels, or the only perturbed one.
+
+    None if there are several with one axis each.
+    """
+    perturbed = [each for each in series.records if each != NONE]
+    several = [each for each in perturbed if len(each.ranges) > 1 or len(perturbed) == 1]
     return max(
         several, key=lambda each: (len(each.ranges), sum(high for *_, high in each.ranges)), default=None
     )
@@ -118,7 +121,7 @@ def _strength(compared: PairedComparison) -> tuple[bool, float]:
 
 
 def _named(costs: Sequence[PairedComparison]) -> str:
-    """Return 'camera:3, 40 points less (p = 0.001), and light:3, ...'."""
+    """Return 'camera:3 (40 points less, p = 0.001) and light:3 (...)'."""
     names = [f"{each.condition} ({_points(each)}, {format_p(each.p_value)})" for each in costs]
     return in_a_row(_some(names))
 
@@ -135,7 +138,8 @@ def _no_difference(others: Sequence[PairedComparison], kind: str) -> str:
     else:
         are_single = all(len(each.pairs[0][1].spec.condition.ranges) == 1 for each in others)
         subject = f"No {kind}{'axis' if are_single else 'condition'} shows a difference"
-    needed = [(number, each) for each in others if (number := each.num_needed)]
+    likely = sorted(others, key=lambda each: each.counts.p_value)[:MAX_NAMED]
+    needed = [(number, each) for each in likely if (number := each.num_needed)]
     if not needed:
         return f"{subject}."
     number, largest = min(needed, key=lambda found: found[0])
@@ -157,7 +161,7 @@ def describe_ranking(panel: Panel) -> Iterator[Statement]:
     rates = {each.policy: rate_of(shared) for each, shared in zip(panel.series, records, strict=True)}
     tied: dict[float, list[str]] = {}
     for each in panel.ranked:
-        tied.setdefault(rates[each.policy].share, []).append(cut(each.policy))
+        tied.setdefault(rates[each.policy].share, []).append(shorten(each.policy))
     places = [
         f"{in_a_row(_some(names))} {'tie at ' if len(names) > 1 else ''}{100 * share:.0f} %"
         for share, names in tied.items()
@@ -173,7 +177,7 @@ def _why_not_ranked(panel: Panel) -> str:
     specs = {each.policy: {record.spec for record in each.group.records} for each in panel.series}
     for first, second in combinations(specs, 2):
         if specs[first].isdisjoint(specs[second]):
-            return f"{cut(first)} and {cut(second)} have no episode in common"
+            return f"{shorten(first)} and {shorten(second)} have no episode in common"
     return "no episode was run by all policies, though each two of them have some in common"
 
 
@@ -188,9 +192,12 @@ def describe_comparison(first: Series, second: Series, compared: Comparisons) ->
     found = [each for each in compared.conditions if _is_of(each, first)]
     nominal = [each for each in found if each.pairs[0][0].spec.perturbations == NONE]
     others = [each for each in found if each.pairs[0][0].spec.perturbations != NONE]
-    names = cut(first.policy), cut(second.policy)
-    parts = [_verdict(each, *names) for each in nominal]
-    if others:
+    names = shorten(first.policy), shorten(second.policy)
+    parts = [_verdict("unperturbed", each, *names) for each in nominal]
+    if len(others) == 1:
+        under = f"{'U' if parts else 'u'}nder {others[0].pairs[0][0].spec.perturbations}"
+        parts.append(_verdict(under, others[0], *names))
+    elif others:
         parts.append(_perturbed_verdict(others, *names))
     return Statement(f"{names[0]} against {names[1]}:", " ".join(parts) or "no episode of both.")
 
@@ -199,19 +206,19 @@ def _is_of(compared: PairedComparison, series: Series) -> bool:
     return settings_of(compared.pairs[0][0]) == series.group.settings
 
 
-def _verdict(compared: PairedComparison, first: str, second: str) -> str:
+def _verdict(where: str, compared: PairedComparison, first: str, second: str) -> str:
     """Return 'unperturbed, act is better by 28 points [12, 43] (40 pairs, p = 0.0068).'."""
     counts, number = compared.counts, f"{compared.counts.n} pairs"
     if counts.difference == 0:
-        return f"unperturbed, they tie ({counts.first} successes each in {number})."
+        return f"{where}, they tie ({counts.first} successes each in {number})."
     low, high = compared.interval
     better, low, high = (first, -high, -low) if counts.difference < 0 else (second, low, high)
     points = f"{100 * abs(counts.difference):.0f} points [{100 * low:.0f}, {100 * high:.0f}]"
     if compared.p_value < SIGNIFICANT:
-        return f"unperturbed, {better} is better by {points} ({number}, {format_p(compared.p_value)})."
+        return f"{where}, {better} is better by {points} ({number}, {format_p(compared.p_value)})."
     needed = f"; about {compared.num_needed:,} pairs would show it" if compared.num_needed else ""
     test = f"{number}, {format_p(compared.p_value)}"
-    return f"unperturbed, no difference is shown: {better} has {points} more ({test}{needed})."
+    return f"{where}, no difference is shown: {better} has {points} more ({test}{needed})."
 
 
 def _perturbed_verdict(found: Sequence[PairedComparison], first: str, second: str) -> str:
@@ -228,5 +235,4 @@ def _perturbed_verdict(found: Sequence[PairedComparison], first: str, second: st
                 f"{name} is better under {len(better)}, most under {condition} (by {points:.0f} points)"
             )
     told = in_a_row(parts) if parts else "none shows a difference"
-    number = f"{len(found)} perturbed conditions" if len(found) > 1 else "the one perturbed condition"
-    return f"Of {number}, {told}."
+    return f"Of {len(found):,} perturbed conditions, {told}."

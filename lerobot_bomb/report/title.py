@@ -1,6 +1,6 @@
 """Title of a report: what was evaluated."""
 
-from lerobot_bomb.report.chart import cut
+from lerobot_bomb.report.chart import shorten
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.sentences import in_a_row
 
@@ -11,7 +11,7 @@ def title_of(report: Report) -> str:
     """Return 'bomb:fdvla and act on bomb (place): 400 episodes, 11 conditions'."""
     policies = list(report.policies)
     few = len(policies) <= MAX_NAMED
-    who = in_a_row([*map(cut, policies)]) if few else f"{len(policies)} policies"
+    who = in_a_row([*map(shorten, policies)]) if few else f"{len(policies)} policies"
     suites: dict[str, dict[str, None]] = {}
     for group in report.groups:
         of_type = suites.setdefault(group.record_type.env_type, {})

@@ -3,7 +3,7 @@
 from lerobot_bomb.conditions import NONE, AxisCondition
 from lerobot_bomb.report.cells import INTERVALS, points, rate
 from lerobot_bomb.report.chart import MAX_SERIES, Chart
-from lerobot_bomb.report.dots import Block, Column, Dot, dot_chart
+from lerobot_bomb.report.dots import Block, Dot, DotColumn, dot_chart
 from lerobot_bomb.report.panels import Panel, Series
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.sentences import describe_comparison, describe_ranking, describe_series
@@ -17,10 +17,10 @@ TITLE = "Success"
 MAX_TOLD = 6  # policies of a panel that have a sentence
 RATE_LABEL = "success, per cent"
 POINTS_LABEL = "change, percentage points"
-NOTE = (
-    f"Left: success with {INTERVALS}. Right: change from the same episodes unperturbed, with Newcombe's 95 % "
-    "interval for pairs; filled where p < 0.05 by the exact McNemar test, adjusted for the policy's "
-    "conditions (Holm)."
+NOTE = f"Success: with {INTERVALS}."
+COST_NOTE = (
+    "Change: from the same episodes unperturbed, with Newcombe's 95 % interval for pairs; filled where "
+    "p < 0.05 by the exact McNemar test, adjusted for the policy's conditions (Holm)."
 )
 SUMMARY_NOTE = (
     f"Success in per cent, with {INTERVALS}: the conditions of one seed are no independent episodes. Shared: "
@@ -42,9 +42,10 @@ def _statements(report: Report, panel: Panel) -> list[Statement]:
     told = panel.ranked[:MAX_TOLD]
     found = list(describe_ranking(panel)) if len(panel.series) > 1 else []
     for other in told[1:]:
-        compared = report.compared(told[0].policy, other.policy)
+        first, second = sorted((told[0], other), key=lambda each: each.place)
+        compared = report.compared(first.policy, second.policy)
         if compared is not None:
-            found.append(describe_comparison(told[0], other, compared))
+            found.append(describe_comparison(first, second, compared))
     return found + [describe_series(each, panel) for each in told]
 
 
@@ -70,7 +71,8 @@ def _chart(report: Report) -> Chart:
         title = "Success by condition, and what each condition costs"
         series, blocks, note = names, [*map(_condition_block, report.panels)], NOTE
     left = dict.fromkeys(panel.left_out for panel in report.panels)
-    note = " ".join([note, *filter(None, left)])
+    has_costs = not many and any(each.costs for panel in report.panels for each in panel.series)
+    note = " ".join([note, *([COST_NOTE] if has_costs else []), *filter(None, left)])
     tables = [_summary(report), *(conditions(each) for panel in report.panels for each in panel.series)]
     return Chart(title, dot_chart(title, series, blocks), tables, note)
 
@@ -81,9 +83,9 @@ def _condition_block(panel: Panel) -> Block:
     series = panel.series
     rates = {each.place: [_rate_dot(each.rates.get(condition)) for condition in shown] for each in series}
     costs = {each.place: [_cost_dot(each.costs.get(condition)) for condition in shown] for each in series}
-    columns = [Column(RATE_LABEL, rates, (-2, 102))]
+    columns = [DotColumn(RATE_LABEL, rates, (-2, 102))]
     if any(each.costs for each in series):
-        columns.append(Column(POINTS_LABEL, costs, line=0))
+        columns.append(DotColumn(POINTS_LABEL, costs, line=0))
     rows = ["unperturbed" if condition == NONE else str(condition) for condition in shown]
     return Block(panel.name, rows, columns)
 
@@ -96,7 +98,7 @@ def _policy_block(panel: Panel) -> Block:
         [_rate_dot(each.perturbed) for each in ranked],
     ]
     rows = [each.policy for each in ranked]
-    return Block(panel.name, rows, [Column(RATE_LABEL, dict(enumerate(dots)), (-2, 102))])
+    return Block(panel.name, rows, [DotColumn(RATE_LABEL, dict(enumerate(dots)), (-2, 102))])
 
 
 def _rate_dot(found: Rate | None) -> Dot | None:

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_bomb.conditions import MAX_LEVEL
 from lerobot_bomb.report.cells import INTERVALS, rate
-from lerobot_bomb.report.chart import COLORS, MARKERS, MAX_SERIES, WIDTH, Chart, draw, plain, tidy
+from lerobot_bomb.report.chart import COLORS, MARKERS, MAX_SERIES, WIDTH, Chart, chart_text, draw, tidy
 from lerobot_bomb.report.dots import add_legend
 from lerobot_bomb.report.panels import Panel, Series
 from lerobot_bomb.report.report import Report
@@ -79,7 +79,7 @@ def _chart(
                 rates = {level: rate_of(records) for level, records in sorted(by_level.items()) if records}
                 place = places.get(each.place, each.place)
                 _paint_curve(small, rates, place, SHIFT * (number - (len(shown) - 1) / 2))
-            small.set_title(plain(axis), loc="left")
+            small.set_title(chart_text(axis), loc="left")
             small.set_ylim(-3, 103)
             small.set_xticks(range(MAX_LEVEL + 1))
             tidy(small, "y")

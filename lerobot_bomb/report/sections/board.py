@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.report.cells import rate
-from lerobot_bomb.report.chart import INK, MAX_SERIES, Chart, draw, plain
+from lerobot_bomb.report.chart import INK, MAX_SERIES, Chart, chart_text, draw
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
 from lerobot_bomb.results.bomb import EpisodeResult, is_grounded, put_down
@@ -34,7 +34,7 @@ type Intersection = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Board:
+class BoardResults:
     """Episodes of a group with one target each."""
 
     name: str
@@ -74,12 +74,12 @@ def section(report: Report) -> Section:
     return Section(TITLE, [], charts=charts)
 
 
-def _board(name: str, group: Group) -> Board:
+def _board(name: str, group: Group) -> BoardResults:
     records = [each for each in group.records if isinstance(each, EpisodeResult) and each.target is not None]
-    return Board(name, records)
+    return BoardResults(name, records)
 
 
-def _rates(boards: Sequence[Board]) -> Table:
+def _rates(boards: Sequence[BoardResults]) -> Table:
     rows = [
         [Cell(board.name), *map(_place_cell, target), rate([r for r in board.records if r.target == target])]
         for board in boards
@@ -88,7 +88,7 @@ def _rates(boards: Sequence[Board]) -> Table:
     return Table("", ["policy, suite", "row", "column", "success"], rows)
 
 
-def _missed(boards: Sequence[Board]) -> Table:
+def _missed(boards: Sequence[BoardResults]) -> Table:
     rows = [
         [Cell(board.name), *map(_place_cell, (*target, *place)), Cell(str(number), number)]
         for board in boards
@@ -102,7 +102,7 @@ def _place_cell(line: int) -> Cell:
     return Cell(str(line), line)
 
 
-def _draw(title: str, boards: Sequence[Board], paint_board: Any) -> str:
+def _draw(title: str, boards: Sequence[BoardResults], paint_board: Any) -> str:
     columns = min(len(boards), 3)
     rows = -(-len(boards) // columns)
 
@@ -119,7 +119,7 @@ def _draw(title: str, boards: Sequence[Board], paint_board: Any) -> str:
 
 def _paint_lines(axes: "Axes", name: str) -> None:
     """Draw the lines of an empty board, row 0 on top."""
-    axes.set_title(plain(name), loc="left")
+    axes.set_title(chart_text(name), loc="left")
     axes.set_aspect("equal")
     for line in range(SIZE):
         axes.plot([0, SIZE - 1], [line, line], color=INK, linewidth=0.6, alpha=0.35, zorder=1)
@@ -135,13 +135,13 @@ def _paint_lines(axes: "Axes", name: str) -> None:
         spine.set_visible(False)
 
 
-def _paint_rates(axes: "Axes", board: Board) -> None:
+def _paint_rates(axes: "Axes", board: BoardResults) -> None:
     for (row, column), found in board.rates.items():
         axes.scatter(column, row, s=420, color=BLUE, alpha=0.1 + 0.5 * found.share, linewidth=0, zorder=2)
         axes.text(column, row, f"{100 * found.share:.0f}", ha="center", va="center", zorder=3)
 
 
-def _paint_missed(axes: "Axes", board: Board) -> None:
+def _paint_missed(axes: "Axes", board: BoardResults) -> None:
     most = max(board.missed.values(), default=1)
     arrow = {
         "arrowstyle": "-|>",

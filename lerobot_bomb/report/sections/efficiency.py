@@ -2,7 +2,7 @@
 
 from lerobot_bomb.bootstrap import Estimate
 from lerobot_bomb.report.chart import MAX_BARS, Chart
-from lerobot_bomb.report.dots import Block, Column, Dot, dot_chart
+from lerobot_bomb.report.dots import Block, Dot, DotColumn, dot_chart
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
 from lerobot_bomb.results.efficiency import Efficiency, efficiencies, smoothness_of
@@ -49,7 +49,7 @@ def _latency_chart(found: list[tuple[str, Efficiency]]) -> Chart:
     ]
     latency = [Dot(each.latency_p50_ms, each.latency_p50_ms, each.latency_p95_ms) for _, each in shown]
     columns = [
-        Column(
+        DotColumn(
             "latency, ms: p50 to p95",
             {0: [*latency]},
             (0, 1.05 * max(each.latency_p95_ms for _, each in shown)),
@@ -57,7 +57,7 @@ def _latency_chart(found: list[tuple[str, Efficiency]]) -> Chart:
     ]
     passes = [None if each.passes is None else Dot(each.passes, None, None) for _, each in shown]
     if any(passes):
-        columns.append(Column("passes per query", {0: passes}))
+        columns.append(DotColumn("passes per query", {0: passes}))
     note = "Device: " + ", ".join(dict.fromkeys(each.device for _, each in shown)) + "."
     return Chart(title, dot_chart(title, [""], [Block("", names, columns)]), [table], note)
 
@@ -71,7 +71,7 @@ def _smoothness_chart(smooth: dict[str, dict[str, Estimate]]) -> Chart:
     table = Table("Smoothness", ["policy, suite", *SMOOTHNESS], rows, SMOOTHNESS_NOTE)
     shown = dict(list(smooth.items())[:MAX_BARS])
     columns = [
-        Column(f"{name}, per step", {0: [_dot(found[name]) for found in shown.values()]})
+        DotColumn(f"{name}, per step", {0: [_dot(found[name]) for found in shown.values()]})
         for name in SMOOTHNESS
     ]
     return Chart(title, dot_chart(title, [""], [Block("", list(shown), columns)]), [table])

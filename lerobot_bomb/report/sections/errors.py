@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lerobot_bomb.report.chart import COLORS, INK, MAX_SERIES, WIDTH, Chart, draw, plain, tidy
+from lerobot_bomb.report.chart import COLORS, INK, MAX_SERIES, WIDTH, Chart, chart_text, draw, tidy
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
 from lerobot_bomb.results.bomb import EpisodeResult, put_down
@@ -64,7 +64,7 @@ def _curves(title: str, shown: list[str], rows: list[list[Cell]], tolerances: li
                 errors = [max(cell.value, SMALLEST_MM) for cell in row[2:]]
                 style = "-" if kind == "unperturbed" else ":"
                 color = COLORS[shown.index(name)]
-                label = plain(f"{name}, {kind}")
+                label = chart_text(f"{name}, {kind}")
                 axes.plot(errors, PERCENTILES, style, color=color, label=label, drawstyle="steps-post")
         for tolerance in tolerances:
             axes.axvline(tolerance, color=INK, linewidth=0.8, alpha=0.6)

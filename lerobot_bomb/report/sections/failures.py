@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from lerobot_bomb.report.cells import count, rate
-from lerobot_bomb.report.chart import COLORS, INK, MAX_BARS, WIDTH, Chart, draw, plain, tidy
+from lerobot_bomb.report.chart import COLORS, INK, MAX_BARS, WIDTH, Chart, chart_text, draw, tidy
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
 from lerobot_bomb.results.bomb import are_placed, is_grounded, put_down
@@ -68,13 +68,13 @@ def _stacked(title: str, classes: Sequence[str], bars: Table) -> str:
             alpha = SUCCESS_ALPHA if number == 0 else 0.75
             axes.barh(
                 range(len(rows)), shares, left=left, height=0.7, color=color, alpha=alpha, hatch=hatch,
-                linewidth=0, label=plain(name),
+                linewidth=0, label=chart_text(name),
             )  # fmt: skip
             for row, share in enumerate(shares):
                 if share >= MAX_LABEL_SHARE:
                     axes.text(left[row] + share / 2, row, f"{share:.0f}", ha="center", va="center")
             left = [start + share for start, share in zip(left, shares, strict=True)]
-        axes.set_yticks(range(len(rows)), [plain(row[0].text) for row in rows])
+        axes.set_yticks(range(len(rows)), [chart_text(row[0].text) for row in rows])
         axes.set_ylim(len(rows) - 0.4, -0.6)
         axes.set_xlim(0, 100)
         axes.set_xlabel("per cent of episodes")

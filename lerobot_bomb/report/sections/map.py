@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from lerobot_bomb.conditions import NONE
-from lerobot_bomb.report.chart import Chart, draw, plain
+from lerobot_bomb.report.chart import Chart, chart_text, draw
 from lerobot_bomb.report.panels import Panel, Series
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
@@ -48,10 +48,10 @@ def _cell(series: Series, condition: str) -> Cell:
 
 
 def _draw(title: str, table: Table) -> str:
-    names = [plain(row[0].text) for row in table.rows]
+    names = [chart_text(row[0].text) for row in table.rows]
     num_rows, num_columns = len(table.rows), len(table.header) - 1
     left = 0.4 + 0.075 * max(map(len, names))
-    top = 0.2 + 0.065 * max(map(len, map(plain, table.header)))
+    top = 0.2 + 0.065 * max(map(len, map(chart_text, table.header)))
 
     def paint(figure: "Figure") -> None:
         axes = figure.subplots()
@@ -66,7 +66,7 @@ def _draw(title: str, table: Table) -> str:
         axes.set_ylim(num_rows - 0.5, -0.5)
         axes.set_yticks(range(num_rows), names)
         axes.xaxis.tick_top()
-        axes.set_xticks(range(num_columns), [*map(plain, table.header[1:])], rotation=60, ha="left")
+        axes.set_xticks(range(num_columns), [*map(chart_text, table.header[1:])], rotation=60, ha="left")
         axes.tick_params(length=0)
         for spine in axes.spines.values():
             spine.set_visible(False)
