@@ -72,6 +72,24 @@ def test_several_files_are_one_table_and_a_policy_has_one_name_in_it(path: Path,
     assert table[0].split()[:3] == ["file", "policy", "suite"]
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "is_named"),
+    [
+        (row(0), row(0, policy=FDVLA), True),
+        (row(0) + row(0, policy=FDVLA), row(1), False),  # compare takes one policy from each of two files
+        (row(0), row(0, policy=FDVLA, image_size=64), False),
+        (row(0), row(1), False),
+    ],
+)
+def test_a_comparison_is_named_where_there_is_one(
+    first: str, second: str, is_named: bool, path: Path, capsys: Printed
+) -> None:
+    path.write_text(first)
+    Path("s.jsonl").write_text(second)
+    named = [line for line in said(capsys, path, "s.jsonl") if "lerobot-bomb compare r.jsonl s.jsonl" in line]
+    assert len(named) == is_named
+
+
 def test_what_is_kept_apart_is_a_column(path: Path, capsys: Printed) -> None:
     path.write_text(row(0) + row(1, image_size=64) + row(2, "dropped", image_size=64))
     first, *table = said(capsys, path)[:3]

@@ -130,7 +130,7 @@ def _notes(told: list[FileGroups]) -> Iterator[str]:
             yield f"{each.path}: episodes that differ in {', '.join(apart)} are neither pooled nor paired"
         for group in each.groups:
             if unpaired := describe_unpaired(group, each.groups):
-                yield f"{each.path}: {group.name}: {unpaired}"
+                yield f"{each.path}: {shortened(group.name)}: {unpaired}"
 
 
 def _print_details(told: FileGroups) -> None:
@@ -158,10 +158,12 @@ def _print_details(told: FileGroups) -> None:
             print(f"{path}: against the same episodes unperturbed", *against, sep="\n")
 
 
-def _are_two_to_compare(groups: list[Group]) -> bool:
-    """Return True for groups of two policies, if some differ in nothing else."""
-    if len({group.settings[POLICY] for group in groups}) != 2:
+def _are_two_to_compare(told: list[FileGroups]) -> bool:
+    """Return True for two policies, in one file or in a file each, if groups differ in nothing else."""
+    policies = [{group.settings[POLICY] for group in each.groups} for each in told]
+    if len(set().union(*policies)) != 2 or [len(each) for each in policies] not in ([2], [1, 1]):
         return False
+    groups = [group for each in told for group in each.groups]
     return any(a.policy != b.policy and can_compare(a, b) for a, b in combinations(groups, 2))
 
 
@@ -172,7 +174,7 @@ def _next_steps(told: list[FileGroups]) -> Mapping[str, str]:
     if number := sum(not record.is_success for group in groups for record in group.records):
         purpose = f"{number} failure{'s' * (number > 1)}, each with the command that replays it"
         steps[f"{PROGRAM} results {paths} --failures"] = purpose
-    if len(told) <= 2 and _are_two_to_compare(groups):
+    if _are_two_to_compare(told):
         steps[f"{PROGRAM} compare {paths}"] = "both policies on the same episodes"
     steps[f"{PROGRAM} report {paths}"] = "figures, failures and settings as one page"
     return steps
