@@ -90,6 +90,12 @@ def libero_with_assets(libero: "Libero", shared_data: Path) -> "Libero":
     return libero
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Return the path of a results file that a test may write."""
+    return tmp_path / "results.jsonl"
+
+
 @pytest.fixture(scope="session")
 def pusht_demonstrations(shared_data: Path) -> "Demonstrations":
     """The first real PushT demonstrations."""

@@ -5,17 +5,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from explain_cases import NAMES
 
 from lerobot_bomb.commands.main import main
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == "vla0_smol" else pytest.mark.long) for name in NAMES]
-)
-def test_one_episode(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.one_type
+def test_one_episode(policy_type: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "why"
-    flags = [f"--policy.path=bomb:{name}", "--seed=100000", "--grid=4", f"--output={output}"]
+    flags = [f"--policy.path=bomb:{policy_type}", "--seed=100000", "--grid=4", f"--output={output}"]
     assert main(["explain", *flags]) == 0
     printed = capsys.readouterr().out
     assert {path.name for path in output.iterdir()} == {

@@ -16,11 +16,6 @@ from lerobot_bomb.results.reading import parse_record
 from lerobot_bomb.viewing.replay import MAX_BATCH, Replay
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "results.jsonl"
-
-
 def damage_of(line: dict[str, Any] | str) -> str:
     """Return what is wrong with a line; '' if nothing is."""
     text = line if isinstance(line, str) else json.dumps(line)

@@ -22,11 +22,6 @@ from lerobot_bomb.results.record import Record, field_names
 from lerobot_bomb.results.summary import summarise
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "results.jsonl"
-
-
 def test_a_record_is_read_as_it_was_written() -> None:
     written = EpisodeResult(**{name: getattr(read(values(3)), name) for name in field_names(EpisodeResult)})
     assert parse_record(written.to_json().encode()) == written

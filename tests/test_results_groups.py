@@ -19,11 +19,6 @@ from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_bomb.results.summary import summarise
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "results.jsonl"
-
-
 def test_summary_counts_successes_errors_and_failures(path: Path) -> None:
     lines = [row(0), row(1, error=3.0), row(2, "imprecise", 14.0), row(3, "never_reached", 200.0)]
     lines += [row(4, "dropped", 99.0), row(5, "wrong_intersection", 45.0), row(6, "disturbed_others", 2.0)]
