@@ -55,7 +55,8 @@ def draw(title: str, size: tuple[float, float], paint: Callable[["Figure"], None
 
     with matplotlib.rc_context():
         matplotlib.rcdefaults()  # whatever the user's own settings are
-        matplotlib.rcParams.update(STYLE | {"svg.hashsalt": title})
+        style: Any = STYLE | {"svg.hashsalt": title}
+        matplotlib.rcParams.update(style)
         figure = Figure(figsize=size, layout="constrained")
         paint(figure)
         text = io.StringIO()

@@ -8,7 +8,7 @@ MAX_NAMED = 3  # policies and suites that a title names
 
 
 def title_of(report: Report) -> str:
-    """Return 'bomb:fdvla and act on bomb (place): 400 episodes, 11 conditions'."""
+    """Return 'act and pi0 on bomb (place): 400 episodes, 11 conditions'."""
     policies = list(report.policies)
     few = len(policies) <= MAX_NAMED
     who = in_a_row([*map(shorten, policies)]) if few else f"{len(policies)} policies"

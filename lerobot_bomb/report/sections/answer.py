@@ -104,8 +104,10 @@ def _policy_block(panel: Panel) -> Block:
 def _rate_dot(found: Rate | None) -> Dot | None:
     if found is None:
         return None
-    low, high = found.interval or (None, None)
-    return Dot(100 * found.share, *(None if each is None else 100 * each for each in (low, high)))
+    if found.interval is None:
+        return Dot(100 * found.share, None, None)
+    low, high = found.interval
+    return Dot(100 * found.share, 100 * low, 100 * high)
 
 
 def _cost_dot(found: PairedComparison | None) -> Dot | None:
