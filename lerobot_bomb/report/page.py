@@ -3,12 +3,16 @@
 from collections.abc import Sequence
 from html import escape
 
-from lerobot_bomb.report.table import Cell, Section, Table
+from lerobot_bomb.report.chart import Chart, cut
+from lerobot_bomb.report.table import Cell, Section, Statement, Table
 
 # one hue in different strengths, which reads the same for the colour-blind
 SHADE = "background:rgba(0,114,178,{:.2f})"
 MAX_STRENGTH = 0.55  # text stays readable on it, black or white
 MAX_UNBROKEN = 24  # characters of a cell that stay in one line, even where the table is too wide
+MAX_TEXT = 240  # characters of a name or cell that are shown; the rest is shown under the pointer
+MAX_HOVER = 6000  # characters shown under the pointer
+MAX_ROWS = 200  # of a table that the page shows; the files beside it have all
 STYLE = """
 :root{color-scheme:light dark}
 body{font:15px/1.5 system-ui,sans-serif;max-width:75rem;margin:0 auto;padding:1rem}
@@ -22,6 +26,12 @@ th.text,td.text{text-align:left}
 td.long{white-space:normal;overflow-wrap:anywhere;min-width:9rem}
 p.note{opacity:.75;max-width:60rem;font-size:.9rem}
 figure{margin:1rem 0}figure img{image-rendering:pixelated;margin-right:.3rem}
+figcaption{font-weight:600;font-size:1rem}
+figure svg{display:block;max-width:100%;min-width:34rem;height:auto}
+figure svg.full{max-width:none}
+p.statement{max-width:60rem;margin:.5rem 0}
+h1,h2,h3,b,summary{overflow-wrap:anywhere}
+details{margin:.5rem 0}summary{cursor:pointer;opacity:.85}
 pre{white-space:pre-wrap;overflow-wrap:anywhere;font-size:.85rem}
 nav a{display:inline-block;margin-right:1rem}
 video{display:block;width:20rem;max-width:75vw}
@@ -32,11 +42,12 @@ def render(title: str, sections: Sequence[Section]) -> str:
     """Render the whole page as HTML."""
     links = "".join(f'<a href="#{_anchor(section)}">{escape(section.title)}</a>' for section in sections)
     body = "\n".join(_section(section) for section in sections)
+    heading = f"<h1>{_shown(title)}</h1>"
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        f"<h1>{escape(title)}</h1>\n<nav>{links}</nav>\n{body}\n</body>\n</html>\n"
+        f"<title>{escape(cut(title, MAX_TEXT))}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"{heading}\n<nav>{links}</nav>\n{body}\n</body>\n</html>\n"
     )
 
 
@@ -46,22 +57,54 @@ def _anchor(section: Section) -> str:
 
 def _section(section: Section) -> str:
     heading = f'<h2 id="{_anchor(section)}">{escape(section.title)}</h2>'
-    parts = [heading, section.figures]
-    said: set[str] = set()  # notes, each below the first table that has it
-    for table in section.tables:
+    parts = [heading, *map(_statement, section.statements), section.figures, *map(_chart, section.charts)]
+    below = _tables(section.tables)
+    below += [f"<pre>{escape(chr(10).join(section.lines))}</pre>"] if section.lines else []
+    parts += [_folded(section.title, below)] if section.is_folded else below
+    return "\n".join(part for part in parts if part)
+
+
+def _statement(statement: Statement) -> str:
+    return f'<p class="statement"><b>{_shown(statement.subject)}</b> {_shown(statement.text)}</p>'
+
+
+def _chart(chart: Chart) -> str:
+    caption = f"<figcaption>{_shown(chart.title)}</figcaption>"
+    note = f'<p class="note">{escape(chart.note)}</p>' if chart.note else ""
+    numbers = _folded("The numbers", _tables(chart.tables)) if chart.tables else ""
+    return f'<figure>{caption}\n<div class="wide">{chart.svg}</div>{note}{numbers}</figure>'
+
+
+def _folded(title: str, parts: list[str]) -> str:
+    return f"<details><summary>{escape(title)}</summary>\n{chr(10).join(parts)}\n</details>"
+
+
+def _tables(tables: Sequence[Table]) -> list[str]:
+    """Render tables, each note below the first that has it."""
+    parts, said = [], set[str]()
+    for table in tables:
         parts.append(_table(table, "" if table.note in said else table.note))
         said.add(table.note)
-    parts += [f"<pre>{escape(chr(10).join(section.lines))}</pre>"] if section.lines else []
-    return "\n".join(parts)
+    return parts
+
+
+def _shown(text: str) -> str:
+    """Escape a text; of a very long one, show the ends, and the rest under the pointer."""
+    if len(text) <= MAX_TEXT:
+        return escape(text)
+    return f'<span title="{escape(text[:MAX_HOVER])}">{escape(cut(text, MAX_TEXT))}</span>'
 
 
 def _table(table: Table, note: str) -> str:
-    title = f"<h3>{escape(table.title)}</h3>\n" if table.title else ""
+    title = f"<h3>{_shown(table.title)}</h3>\n" if table.title else ""
     kinds = [["text"] if _is_text(table, column) else [] for column in range(len(table.header))]
     names = zip(table.header, kinds, strict=True)
-    head = "".join(f'<th scope="col"{_class(kind)}>{escape(name)}</th>' for name, kind in names)
-    rows = "\n".join(f"<tr>{''.join(map(_cell, row, kinds))}</tr>" for row in table.rows)
-    below = f'\n<p class="note">{escape(note)}</p>' if note else ""
+    head = "".join(f'<th scope="col"{_class(kind)}>{_shown(name)}</th>' for name, kind in names)
+    rows = "\n".join(f"<tr>{''.join(map(_cell, row, kinds))}</tr>" for row in table.rows[:MAX_ROWS])
+    left = len(table.rows) - MAX_ROWS
+    notes = [note] if note else []
+    notes += [f"{left:,} more rows are in the JSON file beside this page."] if left > 0 else []
+    below = "".join(f'\n<p class="note">{escape(each)}</p>' for each in notes)
     grid = f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
     return f'{title}<div class="wide">{grid}</div>{below}'
 
@@ -83,4 +126,4 @@ def _cell(cell: Cell, kind: list[str]) -> str:
         "" if cell.video is None else f'<video controls preload="none" src="{escape(cell.video)}"></video>'
     )
     names = [*kind, "long"] if len(cell.text) > MAX_UNBROKEN else kind
-    return f"<td{_class(names)}{style}>{video}{escape(cell.text)}</td>"
+    return f"<td{_class(names)}{style}>{video}{_shown(cell.text)}</td>"

@@ -1,7 +1,10 @@
-"""Parts of a page: sections of tables of cells."""
+"""Parts of a page: sections of sentences, charts, and tables of cells."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lerobot_bomb.report.chart import Chart
 
 
 @dataclass(frozen=True)
@@ -30,14 +33,34 @@ class Table:
 
 
 @dataclass(frozen=True)
+class Statement:
+    """Sentence about a subject, which stands out."""
+
+    subject: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.subject} {self.text}"
+
+
+@dataclass(frozen=True)
 class Section:
-    """Tables that answer one question."""
+    """Sentences, charts and tables that answer one question."""
 
     title: str
     tables: list[Table]
     lines: list[str] = field(default_factory=list)  # of text below
     figures: str = ""  # HTML, above the tables
+    statements: list[Statement] = field(default_factory=list)  # above all else
+    charts: list["Chart"] = field(default_factory=list)
+    is_folded: bool = False  # tables and lines open on a click
 
     def as_json(self) -> dict[str, Any]:
-        """Return the section as JSON, without figures."""
-        return {"title": self.title, "tables": [each.as_json() for each in self.tables], "lines": self.lines}
+        """Return the section as JSON: of charts their numbers."""
+        return {
+            "title": self.title,
+            "statements": [str(each) for each in self.statements],
+            "charts": [each.as_json() for each in self.charts],
+            "tables": [each.as_json() for each in self.tables],
+            "lines": self.lines,
+        }

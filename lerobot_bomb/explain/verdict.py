@@ -1,0 +1,295 @@
+"""Verdict: what an explanation found, in sentences with their evidence.
+
+It reads the values of `explanation.json`, of one episode or of several. Effects are millimetres by which the
+next executed action changes where they were measured, else drops of the score of the policy's answer.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from lerobot_bomb.explain.aggregate import Mean, means_of
+from lerobot_bomb.explain.facts import (
+    as_recorded,
+    outcome,
+    outcomes,
+    with_masks,
+    without_perturbations,
+    word_name,
+)
+from lerobot_bomb.explain.limits import RESTORES, SHARE, SMALLEST_MM, smallest_drop
+
+type Values = Mapping[str, Any]
+
+ALL = "all cameras"  # objects taken out of all images
+OBJECTS, PATCHES, WORDS = "objects", "patches", "words"
+STONE, BOTH = "stone", "row and column"
+PLACE = ("row", "column")
+MAX_NAMES = 4  # that a sentence lists
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Effect of one input in the phase in which it is largest."""
+
+    name: str
+    phase: str
+    mean: Mean
+    unit: str
+    matters: bool
+
+    @property
+    def size(self) -> float:
+        return abs(self.mean.value)
+
+    @property
+    def amount(self) -> str:
+        """Size with its interval, such as "14.3 mm" or "12.1 mm [9.0, 15.2]"."""
+        form, sign = ".1f" if self.unit == "mm" else ".2g", -1 if self.mean.value < 0 else 1
+        bounds = sorted(sign * bound for bound in self.mean.interval or ())
+        interval = f" [{', '.join(f'{bound:{form}}' for bound in bounds)}]" if bounds else ""
+        return f"{self.size:{form}} {self.unit}{interval}"
+
+    @property
+    def evidence(self) -> str:
+        """Amount and phase: "14.3 mm at grasp"."""
+        return f"{self.amount} at {self.phase}" if self.phase else self.amount
+
+
+def verdict(episodes: Sequence[Values]) -> list[str]:
+    """Return the sentences about one episode, or about several together."""
+    moments = [moment for each in episodes for moment in each["moments"]]
+    return [*_endings(episodes), *reasons(moments)]
+
+
+def _endings(episodes: Sequence[Values]) -> Iterator[str]:
+    if len(episodes) > 1:
+        yield outcomes([each["result"] for each in episodes])
+        return
+    (episode,) = episodes
+    yield outcome(episode["result"])
+    yield from as_recorded(episode["result"], episode.get("recorded"))
+    yield from without_perturbations(episode.get("counterfactuals", ()))
+    yield from with_masks(episode.get("masked_episodes", {}))
+
+
+def reasons(moments: Sequence[Values]) -> list[str]:
+    """Return what the policy's actions depend on in these moments, sentence by sentence."""
+    objects, patches = effects_of(moments, OBJECTS), effects_of(moments, PATCHES)
+    seen = _objects(objects) if objects else _patches(patches)
+    words = _words(effects_of(moments, WORDS), objects or patches)
+    return [*seen, *words, *_followed(moments), *_pointing(moments), *_heads(moments)]
+
+
+def effects_of(moments: Sequence[Values], kind: str) -> list[Effect]:
+    """Return each input's effect in the phase where it is largest, the largest first.
+
+    It matters if it is more than rounding and than a SHARE of the largest of its kind in any phase.
+    """
+    found: dict[str, Effect] = {}
+    for phase, of_phase in _by_phase(moments):
+        for each in _of_phase(of_phase, phase, kind):
+            known = found.get(each.name)
+            if known is None or (each.matters, each.size) > (known.matters, known.size):
+                found[each.name] = each
+    smallest = SHARE * max((each.size for each in found.values()), default=0.0)
+    effects = [replace(each, matters=each.matters and each.size > smallest) for each in found.values()]
+    return sorted(effects, key=lambda each: (not each.matters, -each.size))
+
+
+def _of_phase(moments: Sequence[Values], phase: str, kind: str) -> Iterator[Effect]:
+    in_mm = all(moment.get("moved_mm") for moment in moments)
+    rows = [_READ[kind](moment["moved_mm"] if in_mm else moment) for moment in moments]
+    smallest = SMALLEST_MM
+    if not in_mm:
+        smallest = smallest_drop(max(abs(moment["clean_score"]) for moment in moments))
+    for name, mean in means_of(rows).items():
+        low, high = mean.interval or (mean.value, mean.value)
+        is_sure = low > 0 or high < 0
+        matters = is_sure and abs(mean.value) > smallest
+        yield Effect(name, phase, mean, "mm" if in_mm else moments[0]["unit"], matters)
+
+
+def _read_objects(values: Values) -> dict[str, float]:
+    return dict(values["objects"].get(ALL, {}))
+
+
+def _read_patches(values: Values) -> dict[str, float]:
+    return {
+        f"{key.rpartition('.')[2]} patch {line}, {column}": effect
+        for key, map_GG in values["patches"].items()
+        for line, row in enumerate(map_GG)
+        for column, effect in enumerate(row)
+    }
+
+
+def _read_words(values: Values) -> dict[str, float]:
+    """Return the larger effect of each word, hidden or changed."""
+    found: dict[str, float] = {}
+    for effects in (values["words"], values["others"]):
+        for name, effect in effects.items():
+            if effect is not None and abs(effect) >= abs(found.get(name, 0.0)):
+                found[name] = effect
+    named = {name: effect for name, effect in found.items() if not name.startswith('"')}
+    return named or found
+
+
+_READ: dict[str, Callable[[Values], dict[str, float]]] = {
+    OBJECTS: _read_objects, PATCHES: _read_patches, WORDS: _read_words
+}  # fmt: skip
+
+
+def _changed(effect: Effect) -> str:
+    """Return what changes, such as "changes the next action by at most 0.3 mm"."""
+    if effect.unit == "mm":
+        return f"changes the next action by at most {effect.amount}"
+    return f"lowers the score of its answer by at most {effect.amount}"
+
+
+def _thing(name: str) -> str:
+    return {"target": "the target intersection", "other stones": "the other stones"}.get(name, f"the {name}")
+
+
+def _objects(effects: Sequence[Effect]) -> Iterator[str]:
+    """Yield what it looks at and what it never looked at; the latter first if that is the stone."""
+    used = [each for each in effects if each.matters]
+    unused = sorted([each for each in effects if not each.matters], key=lambda each: each.name != STONE)
+    if not used:
+        yield f"It looks at nothing in its images: hiding any one thing {_changed(effects[0])}."
+        return
+    looks = _listed([f"{_thing(each.name)} ({each.evidence})" for each in used])
+    measured = "the next action moves" if used[0].unit == "mm" else "the score of its answer drops"
+    first = f"It looks at {looks}: so much {measured} when that is hidden."
+    never = ""
+    if unused:
+        names = _listed([_thing(each.name) for each in unused])
+        largest = _changed(max(unused, key=lambda each: each.size))
+        it = "it" if len(unused) == 1 else "any of these"
+        beside = f"hiding {_thing(used[0].name)} by {used[0].evidence}"
+        never = f"It never looked at {names}: hiding {it} {largest}, {beside}."
+    is_blind = bool(unused) and unused[0].name == STONE
+    yield from (each for each in ((never, first) if is_blind else (first, never)) if each)
+
+
+def _patches(effects: Sequence[Effect]) -> Iterator[str]:
+    used = [each for each in effects if each.matters]
+    if len(used) > 1:
+        most = f"most of all {used[0].name} ({used[0].evidence})"
+        yield f"{len(used)} of {len(effects)} image patches matter, {most}."
+    elif used:
+        yield f"Of all image patches, only {used[0].name} matters ({used[0].evidence})."
+    elif effects:
+        yield f"No single patch of its images matters: hiding one {_changed(effects[0])}."
+
+
+def _words(effects: Sequence[Effect], seen: Sequence[Effect]) -> Iterator[str]:
+    """Yield which words decide; ``seen``: the effects of what is in the images."""
+    if not effects:
+        yield "It reads no instruction."
+        return
+    used = {each.name: each for each in effects if each.matters}
+    if not used:
+        largest = _changed(effects[0])
+        yield f"It does not read the instruction: hiding or changing any of its words {largest}."
+        return
+    if used.keys() >= {*PLACE, BOTH}:
+        used = {name: each for name, each in used.items() if name not in PLACE}
+    elif not used.keys() & {*PLACE} or len(used.keys() & {*PLACE}) == 1:
+        used = {name: each for name, each in used.items() if name != BOTH}
+    told = _listed([f"{word_name(each.name)} ({each.evidence})" for each in used.values()])
+    verb = "decides" if len(used) == 1 and BOTH not in used else "decide"
+    unread = [each for each in effects if not each.matters]
+    rest = f"; no other word does (at most {unread[0].amount})" if unread else ""
+    only = "only " if len(used) == 1 else ""
+    yield f"Of the instruction, {only}{told} {verb}{rest}{_weakly([*used.values()], seen)}."
+
+
+def _weakly(used: Sequence[Effect], seen: Sequence[Effect]) -> str:
+    most = max((each.size for each in seen), default=0.0)
+    return " - weakly, beside what it sees" if used[0].size < SHARE * most else ""
+
+
+def _followed(moments: Sequence[Values]) -> Iterator[str]:
+    """Yield how far the next action turns to another target that the sentence names."""
+    found: dict[str, Effect] = {}
+    for phase, of_phase in _by_phase(moments):
+        rows = [
+            {word: each["along_mm"] for word, each in moment.get("following", {}).items() if word in PLACE}
+            for moment in of_phase
+        ]
+        for word, mean in means_of(_known(rows)).items():
+            if mean.value > max(SMALLEST_MM, found[word].mean.value if word in found else 0.0):
+                found[word] = Effect(f"another {word}", phase, mean, "mm", True)
+    if found:
+        told = _listed([f"{each.evidence} for {each.name}" for each in found.values()])
+        yield f"Told to go elsewhere, the next action turns there: {told}."
+
+
+def _known(rows: Sequence[Mapping[str, float | None]]) -> list[dict[str, float]]:
+    return [{name: value for name, value in row.items() if value is not None} for row in rows]
+
+
+def _by_phase(moments: Sequence[Values]) -> Iterator[tuple[str, list[Values]]]:
+    for phase in dict.fromkeys(moment["phase"] for moment in moments):
+        yield phase, [moment for moment in moments if moment["phase"] == phase]
+
+
+def _pointing(moments: Sequence[Values]) -> Iterator[str]:
+    """Yield where it points wrongly, or does not act on what it points at."""
+    checks = [(each["phase"], each["pointing"]) for each in moments if "pointing" in each]
+    wrong = [(phase, each) for phase, each in checks if each["place"] != each["meant_place"]]
+    right = [(phase, each) for phase, each in checks if each["place"] == each["meant_place"]]
+    idle = [phase for phase, each in right if not each["goes_there"]]
+    if wrong:
+        told = [f"{each['place']}, not {each['meant_place']} (at {phase})" for phase, each in wrong]
+        yield f"It misreads the place in {len(wrong)} of {len(checks)} moments: it points at {_listed(told)}."
+    if idle:
+        told = f"{len(idle)} of {len(right)} moments (at {_listed([*dict.fromkeys(idle)])})"
+        yield f"It points at the place that is meant, but its next action does not go there, in {told}."
+    if checks and not wrong and not idle:
+        yield "It points at the place that is meant, and its next action goes there."
+
+
+def _heads(moments: Sequence[Values]) -> Iterator[str]:
+    """Yield the heads that alone bring back what another instruction takes away."""
+    drop, phase, ratios = max(map(_restored, _by_phase(moments)), key=lambda each: each[0])
+    found = {name: ratio for name, ratio in ratios.items() if ratio >= RESTORES}
+    names = sorted(found, key=lambda name: -found[name])
+    if not names or drop == 0:
+        return
+    told = _listed([f"{name} ({found[name]:.0%})" for name in names])
+    at = f" at {phase}" if phase else ""
+    if len(names) == 1:
+        yield f"One head alone carries the instruction{at}: {told} of its effect comes back with it."
+    else:
+        yield f"{len(names)} heads each carry the instruction{at}: {told} of its effect comes back with each."
+
+
+def _restored(phase_moments: tuple[str, list[Values]]) -> tuple[float, str, dict[str, float]]:
+    """Return mean drop after another instruction, the phase, and what each head brings back of it."""
+    phase, moments = phase_moments
+    found = [
+        restored
+        for moment in moments
+        for restored in moment["restored"]
+        if "instruction" in restored["corruption"]
+        and abs(restored["drop"]) > smallest_drop(moment["clean_score"])
+    ]
+    rows = [
+        {
+            f"layer {layer}, head {head}": ratio
+            for layer, heads in enumerate(restored["heads"])
+            for head, ratio in enumerate(heads)
+        }
+        for restored in found
+    ]
+    drop = sum(abs(each["drop"]) for each in found) / len(found) if found else 0.0
+    return drop, phase, {name: mean.value for name, mean in means_of(_known(rows)).items()}
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Join names as "a, b and c", at most a few."""
+    shown = [*names[:MAX_NAMES]]
+    if len(names) > MAX_NAMES:
+        shown.append(f"{len(names) - MAX_NAMES} more")
+    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}" if shown else ""
