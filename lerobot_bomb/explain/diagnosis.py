@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self
 
-from lerobot_bomb.explain.limits import RESTORES, SHARE, smallest_drop
-from lerobot_bomb.explain.moment import ALL, Explanation, PatchingResult, camera_name
+from lerobot_bomb.explain.limits import ALL, RESTORES, SHARE, smallest_drop
+from lerobot_bomb.explain.moment import Explanation, PatchingResult, camera_name
 
 MAX_NAMES = 6  # that are shown
 

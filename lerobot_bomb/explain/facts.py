@@ -77,13 +77,6 @@ def as_recorded(result: Values, recorded: Values | None) -> list[str]:
     return [f"In its record it ended otherwise ({then}): what follows is about the run shown here."]
 
 
-def settled_by(counterfactuals: Sequence[Values]) -> Values | None:
-    """Return the run that says most: a success without the fewest perturbations, or the unperturbed one."""
-    by_size = sorted(counterfactuals, key=lambda each: len(each["without"]))
-    successes = (each for each in by_size if each["result"]["is_success"])
-    return next(successes, next((each for each in by_size if each["perturbations"] == NONE), None))
-
-
 def without_perturbations(counterfactuals: Sequence[Values]) -> list[str]:
     """Return what the same seed without some of its perturbations says."""
     if not counterfactuals:
@@ -92,21 +85,19 @@ def without_perturbations(counterfactuals: Sequence[Values]) -> list[str]:
     single = [each for each in counterfactuals if len(each["without"]) == 1]
     helped = [each for each in single if each["result"]["is_success"]]
     if helped:
-        ways = " or ".join(f"without {each['without'][0]} ({_short(each['result'])})" for each in helped)
+        ways = " or ".join(f"{each['without'][0]}{_steps(each['result'])}" for each in helped)
         rest = len(single) - len(helped)
         others = f"; without any one of the other {rest} it fails too" if rest else ""
-        return [f"The same seed {ways} ends well{others}."]
+        return [f"The same seed succeeds without the perturbation {ways}{others}."]
     if clean["result"]["is_success"]:
-        told = f"The same seed without all {len(clean['without'])} perturbations {_short(clean['result'])}"
-        return [f"{told}; without any single one of them it fails too: they break it together."]
-    return [
-        f"The perturbations alone do not explain it: the same seed unperturbed {_short(clean['result'])}."
-    ]
+        told = f"The same seed succeeds unperturbed{_steps(clean['result'])}"
+        return [f"{told}, but without any single perturbation it fails too: they break it together."]
+    failure = clean["result"]["failure"]
+    return [f"The perturbations are not the reason: the same seed unperturbed fails too ({failure})."]
 
 
-def _short(result: Values) -> str:
-    ended = "succeeds" if result["is_success"] else f"fails too ({result['failure']})"
-    return f"{ended} after {result['steps']} steps"
+def _steps(result: Values) -> str:
+    return f" (after {result['steps']} steps)" if "steps" in result else ""
 
 
 def with_masks(masked: Mapping[str, Values]) -> list[str]:

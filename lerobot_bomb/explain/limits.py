@@ -1,5 +1,6 @@
-"""Limits below which an effect counts as none."""
+"""Limits below which an effect counts as none; a name of effects."""
 
+ALL = "all cameras"  # an object's effect where it is taken out of all images at once
 # a drop of the score that is no larger than this share of it, or this in its unit, may be rounding
 SMALLEST_DROP = 1e-4
 SHARE = 0.05  # an effect below this share of the largest of its kind is none

@@ -17,11 +17,10 @@ from lerobot_bomb.explain.facts import (
     without_perturbations,
     word_name,
 )
-from lerobot_bomb.explain.limits import RESTORES, SHARE, SMALLEST_MM, smallest_drop
+from lerobot_bomb.explain.limits import ALL, RESTORES, SHARE, SMALLEST_MM, smallest_drop
 
 type Values = Mapping[str, Any]
 
-ALL = "all cameras"  # objects taken out of all images
 OBJECTS, PATCHES, WORDS = "objects", "patches", "words"
 STONE, BOTH = "stone", "row and column"
 PLACE = ("row", "column")
@@ -131,6 +130,8 @@ def _read_words(values: Values) -> dict[str, float]:
             if effect is not None and abs(effect) >= abs(found.get(name, 0.0)):
                 found[name] = effect
     named = {name: effect for name, effect in found.items() if not name.startswith('"')}
+    if BOTH in named:
+        named[BOTH] = max((named[name] for name in (*PLACE, BOTH) if name in named), key=abs)
     return named or found
 
 

@@ -63,7 +63,7 @@ def draw(title: str, size: tuple[float, float], paint: Callable[["Figure"], None
 
 
 def _inline(svg: str, title: str, size: tuple[float, float]) -> str:
-    """Return the `svg` element for a page: named, in the page's colour and font, as wide as the page allows."""
+    """Return the `svg` element for a page: named, in the page's colour and font."""
     body = svg[svg.index("<svg") :]
     body = body[body.index(">") + 1 :]
     body = re.sub(r"<metadata>.*?</metadata>\s*", "", body, flags=re.DOTALL)
