@@ -63,7 +63,7 @@ def run_counterfactuals(
 
 
 def settled_by(counterfactuals: Sequence[Counterfactual]) -> Counterfactual | None:
-    """Return the one that says most: a success with the fewest perturbations taken away, or the unperturbed."""
+    """Return the one that says most: a success under most perturbations, or the unperturbed one."""
     by_size = sorted(counterfactuals, key=lambda each: len(each.without))
     successes = [each for each in by_size if each.run.result.is_success]
     return next(iter(successes), by_size[-1] if by_size else None)
