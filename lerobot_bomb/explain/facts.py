@@ -4,14 +4,12 @@ They read the values of `explanation.json`.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from lerobot_bomb.bomb.episode import Failure
 from lerobot_bomb.bomb.judge import COLLATERAL_TOLERANCE_MM
 from lerobot_bomb.conditions import NONE
+from lerobot_bomb.explain.effects import Values
 from lerobot_bomb.stats import format_rate
-
-type Values = Mapping[str, Any]
 
 # what happened, by failure class of BOMB
 HAPPENED = {

@@ -1,14 +1,23 @@
 """Verdict: what an explanation found, in sentences with their evidence.
 
-It reads the values of `explanation.json`, of one episode or of several. Effects are millimetres by which the
-next executed action changes where they were measured, else drops of the score of the policy's answer.
+It reads the values of `explanation.json`, of one episode or of several.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Iterator, Sequence
 
-from lerobot_bomb.explain.aggregate import Mean, means_of
+from lerobot_bomb.explain.aggregate import means_of
+from lerobot_bomb.explain.effects import (
+    BOTH,
+    OBJECTS,
+    PATCHES,
+    PLACE,
+    WORDS,
+    Effect,
+    Values,
+    by_phase,
+    effects_of,
+    known,
+)
 from lerobot_bomb.explain.facts import (
     as_recorded,
     outcome,
@@ -17,42 +26,10 @@ from lerobot_bomb.explain.facts import (
     without_perturbations,
     word_name,
 )
-from lerobot_bomb.explain.limits import ALL, RESTORES, SHARE, SMALLEST_MM, smallest_drop
+from lerobot_bomb.explain.limits import RESTORES, SHARE, SMALLEST_MM, smallest_drop
 
-type Values = Mapping[str, Any]
-
-OBJECTS, PATCHES, WORDS = "objects", "patches", "words"
-STONE, BOTH = "stone", "row and column"
-PLACE = ("row", "column")
+STONE = "stone"
 MAX_NAMES = 4  # that a sentence lists
-
-
-@dataclass(frozen=True)
-class Effect:
-    """Effect of one input in the phase in which it is largest."""
-
-    name: str
-    phase: str
-    mean: Mean
-    unit: str
-    matters: bool
-
-    @property
-    def size(self) -> float:
-        return abs(self.mean.value)
-
-    @property
-    def amount(self) -> str:
-        """Size with its interval, such as "14.3 mm" or "12.1 mm [9.0, 15.2]"."""
-        form, sign = ".1f" if self.unit == "mm" else ".2g", -1 if self.mean.value < 0 else 1
-        bounds = sorted(sign * bound for bound in self.mean.interval or ())
-        interval = f" [{', '.join(f'{bound:{form}}' for bound in bounds)}]" if bounds else ""
-        return f"{self.size:{form}} {self.unit}{interval}"
-
-    @property
-    def evidence(self) -> str:
-        """Amount and phase: "14.3 mm at grasp"."""
-        return f"{self.amount} at {self.phase}" if self.phase else self.amount
 
 
 def verdict(episodes: Sequence[Values]) -> list[str]:
@@ -80,66 +57,6 @@ def reasons(moments: Sequence[Values]) -> list[str]:
     return [*seen, *words, *_followed(moments), *_pointing(moments), *_heads(moments)]
 
 
-def effects_of(moments: Sequence[Values], kind: str) -> list[Effect]:
-    """Return each input's effect in the phase where it is largest, the largest first.
-
-    It matters if it is more than rounding and than a SHARE of the largest of its kind in any phase.
-    """
-    found: dict[str, Effect] = {}
-    for phase, of_phase in _by_phase(moments):
-        for each in _of_phase(of_phase, phase, kind):
-            known = found.get(each.name)
-            if known is None or (each.matters, each.size) > (known.matters, known.size):
-                found[each.name] = each
-    smallest = SHARE * max((each.size for each in found.values()), default=0.0)
-    effects = [replace(each, matters=each.matters and each.size > smallest) for each in found.values()]
-    return sorted(effects, key=lambda each: (not each.matters, -each.size))
-
-
-def _of_phase(moments: Sequence[Values], phase: str, kind: str) -> Iterator[Effect]:
-    in_mm = all(moment.get("moved_mm") for moment in moments)
-    rows = [_READ[kind](moment["moved_mm"] if in_mm else moment) for moment in moments]
-    smallest = SMALLEST_MM
-    if not in_mm:
-        smallest = smallest_drop(max(abs(moment["clean_score"]) for moment in moments))
-    for name, mean in means_of(rows).items():
-        low, high = mean.interval or (mean.value, mean.value)
-        is_sure = low > 0 or high < 0
-        matters = is_sure and abs(mean.value) > smallest
-        yield Effect(name, phase, mean, "mm" if in_mm else moments[0]["unit"], matters)
-
-
-def _read_objects(values: Values) -> dict[str, float]:
-    return dict(values["objects"].get(ALL, {}))
-
-
-def _read_patches(values: Values) -> dict[str, float]:
-    return {
-        f"{key.rpartition('.')[2]} patch {line}, {column}": effect
-        for key, map_GG in values["patches"].items()
-        for line, row in enumerate(map_GG)
-        for column, effect in enumerate(row)
-    }
-
-
-def _read_words(values: Values) -> dict[str, float]:
-    """Return the larger effect of each word, hidden or changed."""
-    found: dict[str, float] = {}
-    for effects in (values["words"], values["others"]):
-        for name, effect in effects.items():
-            if effect is not None and abs(effect) >= abs(found.get(name, 0.0)):
-                found[name] = effect
-    named = {name: effect for name, effect in found.items() if not name.startswith('"')}
-    if BOTH in named:
-        named[BOTH] = max((named[name] for name in (*PLACE, BOTH) if name in named), key=abs)
-    return named or found
-
-
-_READ: dict[str, Callable[[Values], dict[str, float]]] = {
-    OBJECTS: _read_objects, PATCHES: _read_patches, WORDS: _read_words
-}  # fmt: skip
-
-
 def _changed(effect: Effect) -> str:
     """Return what changes, such as "changes the next action by at most 0.3 mm"."""
     if effect.unit == "mm":
@@ -154,9 +71,14 @@ def _thing(name: str) -> str:
 def _objects(effects: Sequence[Effect]) -> Iterator[str]:
     """Yield what it looks at and what it never looked at; the latter first if that is the stone."""
     used = [each for each in effects if each.matters]
-    unused = sorted([each for each in effects if not each.matters], key=lambda each: each.name != STONE)
+    unsure = [each for each in effects if each.is_open]
+    unused = sorted(
+        [each for each in effects if not each.matters and not each.is_open],
+        key=lambda each: each.name != STONE,
+    )
     if not used:
-        yield f"It looks at nothing in its images: hiding any one thing {_changed(effects[0])}."
+        nothing = f"It looks at nothing in its images: hiding any one thing {_changed(effects[0])}."
+        yield _open(unsure) if unsure else nothing
         return
     looks = _listed([f"{_thing(each.name)} ({each.evidence})" for each in used])
     measured = "the next action moves" if used[0].unit == "mm" else "the score of its answer drops"
@@ -170,6 +92,15 @@ def _objects(effects: Sequence[Effect]) -> Iterator[str]:
         never = f"It never looked at {names}: hiding {it} {largest}, {beside}."
     is_blind = bool(unused) and unused[0].name == STONE
     yield from (each for each in ((never, first) if is_blind else (first, never)) if each)
+    if unsure:
+        yield _open(unsure)
+
+
+def _open(effects: Sequence[Effect]) -> str:
+    """Say of objects or words that these episodes are too few to tell."""
+    names = [word_name(each.name) if each.kind == WORDS else _thing(each.name) for each in effects]
+    told = [f"{name} ({each.evidence})" for name, each in zip(names, effects, strict=True)]
+    return f"No effect is shown, nor excluded, of {_listed(told)}."
 
 
 def _patches(effects: Sequence[Effect]) -> Iterator[str]:
@@ -189,6 +120,10 @@ def _words(effects: Sequence[Effect], seen: Sequence[Effect]) -> Iterator[str]:
         yield "It reads no instruction."
         return
     used = {each.name: each for each in effects if each.matters}
+    unsure = [each for each in effects if each.is_open]
+    if not used and unsure:
+        yield _open(unsure)
+        return
     if not used:
         largest = _changed(effects[0])
         yield f"It does not read the instruction: hiding or changing any of its words {largest}."
@@ -199,7 +134,7 @@ def _words(effects: Sequence[Effect], seen: Sequence[Effect]) -> Iterator[str]:
         used = {name: each for name, each in used.items() if name != BOTH}
     told = _listed([f"{word_name(each.name)} ({each.evidence})" for each in used.values()])
     verb = "decides" if len(used) == 1 and BOTH not in used else "decide"
-    unread = [each for each in effects if not each.matters]
+    unread = [each for each in effects if not each.matters and not each.is_open]
     rest = f"; no other word does (at most {unread[0].amount})" if unread else ""
     only = "only " if len(used) == 1 else ""
     yield f"Of the instruction, {only}{told} {verb}{rest}{_weakly([*used.values()], seen)}."
@@ -213,26 +148,17 @@ def _weakly(used: Sequence[Effect], seen: Sequence[Effect]) -> str:
 def _followed(moments: Sequence[Values]) -> Iterator[str]:
     """Yield how far the next action turns to another target that the sentence names."""
     found: dict[str, Effect] = {}
-    for phase, of_phase in _by_phase(moments):
+    for phase, of_phase in by_phase(moments):
         rows = [
             {word: each["along_mm"] for word, each in moment.get("following", {}).items() if word in PLACE}
             for moment in of_phase
         ]
-        for word, mean in means_of(_known(rows)).items():
+        for word, mean in means_of(known(rows)).items():
             if mean.value > max(SMALLEST_MM, found[word].mean.value if word in found else 0.0):
-                found[word] = Effect(f"another {word}", phase, mean, "mm", True)
+                found[word] = Effect(WORDS, f"another {word}", phase, mean, "mm", True)
     if found:
         told = _listed([f"{each.evidence} for {each.name}" for each in found.values()])
         yield f"Told to go elsewhere, the next action turns there: {told}."
-
-
-def _known(rows: Sequence[Mapping[str, float | None]]) -> list[dict[str, float]]:
-    return [{name: value for name, value in row.items() if value is not None} for row in rows]
-
-
-def _by_phase(moments: Sequence[Values]) -> Iterator[tuple[str, list[Values]]]:
-    for phase in dict.fromkeys(moment["phase"] for moment in moments):
-        yield phase, [moment for moment in moments if moment["phase"] == phase]
 
 
 def _pointing(moments: Sequence[Values]) -> Iterator[str]:
@@ -253,7 +179,7 @@ def _pointing(moments: Sequence[Values]) -> Iterator[str]:
 
 def _heads(moments: Sequence[Values]) -> Iterator[str]:
     """Yield the heads that alone bring back what another instruction takes away."""
-    drop, phase, ratios = max(map(_restored, _by_phase(moments)), key=lambda each: each[0])
+    drop, phase, ratios = max(map(_restored, by_phase(moments)), key=lambda each: each[0])
     found = {name: ratio for name, ratio in ratios.items() if ratio >= RESTORES}
     names = sorted(found, key=lambda name: -found[name])
     if not names or drop == 0:
@@ -285,7 +211,7 @@ def _restored(phase_moments: tuple[str, list[Values]]) -> tuple[float, str, dict
         for restored in found
     ]
     drop = sum(abs(each["drop"]) for each in found) / len(found) if found else 0.0
-    return drop, phase, {name: mean.value for name, mean in means_of(_known(rows)).items()}
+    return drop, phase, {name: mean.value for name, mean in means_of(known(rows)).items()}
 
 
 def _listed(names: Sequence[str]) -> str:
