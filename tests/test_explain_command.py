@@ -59,7 +59,7 @@ def test_several_episodes(number: int, last: str, tmp_path: Path) -> None:
     found = json.loads((output / "explanation.json").read_text())
     titles = [section["title"] for section in found["sections"]]
     phases = ["Reach", "Grasp", "Carry", "Place"]
-    assert titles[:5] == ["Verdict", *(f"{phase}: {number} episodes" for phase in phases)]
+    assert titles[:6] == ["Verdict", "Effects", *(f"{phase}: {number} episodes" for phase in phases)]
     assert titles[-1] == last and len(found["episodes"]) == number
     assert found["verdict"][0].startswith(f"Success: {number}/{number} = 100.0 % [")
     assert "It looks at the stone (" in found["verdict"][1] and " mm [" in found["verdict"][1]

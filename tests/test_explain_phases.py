@@ -6,7 +6,7 @@ import pytest
 from lerobot_bomb.bomb.board import BOARD, NUM_STONES
 from lerobot_bomb.bomb.expert import GRASP_DEPTH_M, SQUEEZE_M
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
-from lerobot_bomb.explain.phases import describe, phases_of
+from lerobot_bomb.explain.phases import gripper_does, phases_of
 
 REST_M = BOARD.thickness_m + BOARD.stone_height_m / 2
 OPEN_M, CLOSED_M = 0.044, 2 * BOARD.stone_radius_m - SQUEEZE_M
@@ -68,9 +68,9 @@ def test_another_stone_put_elsewhere_is_carried_and_placed_too() -> None:
         state(elsewhere, 0.0, closed=False, s1=elsewhere),
     ]
     assert names(states) == ["grasp 1", "carry 1", "place 1", "place 1", "place 1"]
-    assert describe("carry", 1, states[1]) == "carries another stone"
-    assert describe("carry", 0, states[1]) == "carries the stone that is meant"
-    assert describe("reach", None, states[1]) == "moves with open or empty fingers"
+    assert gripper_does("carry", 1, states[1]) == "carries another stone"
+    assert gripper_does("carry", 0, states[1]) == "carries the stone that is meant"
+    assert gripper_does("reach", None, states[1]) == "moves with open or empty fingers"
 
 
 def test_a_missed_grasp_is_followed_by_another_reach() -> None:

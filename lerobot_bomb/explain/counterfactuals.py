@@ -13,7 +13,7 @@ from lerobot_bomb.viewing.episode import Viewed
 
 @dataclass(frozen=True)
 class Counterfactual:
-    """The same episode without some perturbation axes."""
+    """Run of an episode's seed without some of its perturbation axes."""
 
     without: tuple[str, ...]  # axes
     perturbations: str  # condition that is left

@@ -55,7 +55,7 @@ def effects_of(moments: Sequence[Values], kind: str) -> list[Effect]:
     """
     found: dict[str, Effect] = {}
     for phase, of_phase in by_phase(moments):
-        for each in _of_phase(of_phase, phase, kind):
+        for each in effects_in_phase(of_phase, phase, kind):
             known = found.get(each.name)
             if known is None or (each.matters, each.size) > (known.matters, known.size):
                 found[each.name] = each
@@ -67,7 +67,8 @@ def effects_of(moments: Sequence[Values], kind: str) -> list[Effect]:
     return sorted(effects, key=lambda each: (not each.matters, -each.size))
 
 
-def _of_phase(moments: Sequence[Values], phase: str, kind: str) -> Iterator[Effect]:
+def effects_in_phase(moments: Sequence[Values], phase: str, kind: str) -> Iterator[Effect]:
+    """Yield each input's effect in the moments of one phase."""
     in_mm = all(moment.get("moved_mm") for moment in moments)
     rows = known([_READ[kind](moment["moved_mm"] if in_mm else moment) for moment in moments])
     smallest = SMALLEST_MM

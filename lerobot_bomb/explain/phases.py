@@ -73,7 +73,7 @@ def _is_placing(states: Sequence[PrivilegedState], now: int, stone: int) -> bool
     return is_near or (left is not None and float(np.linalg.norm(xy - left.stone_xyz[stone, :2])) <= NEAR_M)
 
 
-def describe(phase: str, stone: int | None, state: PrivilegedState) -> str:
+def gripper_does(phase: str, stone: int | None, state: PrivilegedState) -> str:
     """Say what the gripper does: "carries the stone that is meant"."""
     is_meant = stone == current_goal(state).stone
     return DOES[phase].format("the stone that is meant" if is_meant else "another stone")

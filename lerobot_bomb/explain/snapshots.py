@@ -15,7 +15,7 @@ from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.envs.rollout import Moment, run_episode
 from lerobot_bomb.explain.film import EpisodeRun, Film
-from lerobot_bomb.explain.phases import PHASES, describe, phases_of
+from lerobot_bomb.explain.phases import PHASES, gripper_does, phases_of
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 from lerobot_bomb.viewing.episode import Viewed
 
@@ -66,7 +66,7 @@ def take_snapshots(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Snapshot]
         return taken, run
     states = [each.state for each in taken if each.state is not None]
     named = [
-        replace(each, phase=phase, does=describe(phase, stone, state))
+        replace(each, phase=phase, does=gripper_does(phase, stone, state))
         for each, state, (phase, stone) in zip(taken, states, phases_of(states), strict=True)
     ]
     return named, run

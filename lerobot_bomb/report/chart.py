@@ -8,6 +8,7 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from lerobot_bomb.report.table import Table
+from lerobot_bomb.tables import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,6 +19,7 @@ INK = "#010203"  # of text and axes; the page's own colour takes its place
 COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#999999")
 MARKERS = "osD^vPX"
 MAX_SERIES = 6  # that a chart can show side by side
+MAX_BARS = 80  # below each other
 MAX_NAME = 36  # characters of a name in a chart
 WIDTH = 9.6  # inches: what a page shows without scrolling
 STYLE = {
@@ -63,21 +65,22 @@ def draw(title: str, size: tuple[float, float], paint: Callable[["Figure"], None
 
 
 def _inline(svg: str, title: str, size: tuple[float, float]) -> str:
-    """Return the `svg` element for a page: named, in the page's colour and font."""
+    """Return the `svg` element for a page: named, and in the page's colour and font."""
     body = svg[svg.index("<svg") :]
     body = body[body.index(">") + 1 :]
     body = re.sub(r"<metadata>.*?</metadata>\s*", "", body, flags=re.DOTALL)
+    body = re.sub(r"<style.*?</style>\s*", "", body, flags=re.DOTALL).replace("xlink:href", "href")
     body = re.sub(r'<g id="[^"]*"', "<g", body)  # the same in every figure
     body = re.sub(r"\n\s*", "\n", body.replace("'DejaVu Sans'", "system-ui")).replace(INK, "currentColor")
     width, height = (72 * each for each in size)
     pixels = round(96 * size[0])
     return (
-        f'<svg xmlns:xlink="http://www.w3.org/1999/xlink" role="img" viewBox="0 0 {width:g} {height:g}" '
-        f'style="width:{pixels}px"><title>{escape(title)}</title>{body}'
+        f'<svg role="img" viewBox="0 0 {width:g} {height:g}" '
+        f'style="width:{pixels}px;min-width:min(46rem,{pixels}px)"><title>{escape(title)}</title>{body}'
     )
 
 
-def cut(name: str, most: int = MAX_NAME) -> str:
+def shorten(name: str, most: int = MAX_NAME) -> str:
     """Return a name of at most so many characters, without its middle if it is longer."""
     if len(name) <= most:
         return name
@@ -85,9 +88,9 @@ def cut(name: str, most: int = MAX_NAME) -> str:
     return f"{name[: most - 1 - last]}…{name[-last:]}"
 
 
-def plain(name: str) -> str:
-    """Return a name for matplotlib, which takes `$` for mathematics; cut."""
-    return cut(" ".join(name.split())).replace("$", r"\$")
+def chart_text(name: str) -> str:
+    """Return a name for matplotlib, which takes `$` for mathematics; shortened."""
+    return shorten(printable(name)).replace("$", r"\$")
 
 
 def tidy(axes: "Axes", grid: str = "x") -> None:

@@ -13,7 +13,7 @@ from lerobot_bomb.explain.counterfactuals import Counterfactual
 from lerobot_bomb.explain.film import EpisodeRun, Frame
 from lerobot_bomb.explain.maps import data_url
 from lerobot_bomb.explain.pointing import BLACK, FONT, MARKED_PX, OUTLINE_PX, PLACE_RGB, WHITE, Mark, marked
-from lerobot_bomb.report.chart import COLORS, INK, Chart, draw, plain
+from lerobot_bomb.report.chart import COLORS, INK, Chart, chart_text, draw
 from lerobot_bomb.report.table import Cell, Table
 
 if TYPE_CHECKING:
@@ -123,6 +123,6 @@ def _paint_path(axes: "Axes", number: int, name: str, run: EpisodeRun) -> None:
     dashes, shade = divmod(number - 1, len(COLORS))
     color = INK if is_first else COLORS[(shade + 2) % len(COLORS)]
     style = "-" if is_first else DASHES[dashes % len(DASHES)]
-    label = plain(name)
+    label = chart_text(name)
     axes.plot(*run.gripper_xyz[:, :2].T, style, color=color, linewidth=2.5 if is_first else 1.5, label=label)
     axes.plot(*run.stone_xyz[-1, :2], marker="o", color=color, markersize=6)

@@ -1,4 +1,4 @@
-"""All numbers of an explained moment as tables, for those who want them."""
+"""Tables of all numbers of an explained moment, for those who want them."""
 
 from collections.abc import Mapping
 from dataclasses import replace

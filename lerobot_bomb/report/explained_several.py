@@ -1,18 +1,24 @@
 """Explanations of several episodes as a page: means with intervals, phase by phase."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lerobot_bomb.explain.aggregate import Mean, mean_of, means_of
+from lerobot_bomb.explain.effects import OBJECTS, WORDS, Effect, Values, effects_in_phase
 from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.limits import ALL
 from lerobot_bomb.explain.probes import LayerProbe
 from lerobot_bomb.report.cells import mean_cell
+from lerobot_bomb.report.chart import COLORS, Chart, draw, tidy
 from lerobot_bomb.report.explained_numbers import FOLLOWING_COLUMNS, FOLLOWING_NOTE
 from lerobot_bomb.report.explained_pointing import mean_pointing
 from lerobot_bomb.report.explanation import verdict_section
 from lerobot_bomb.report.table import Cell, Section, Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MIDDLE = "The middle of the episode"
 
@@ -21,11 +27,50 @@ def aggregate_sections(
     sentences: Sequence[str], by_phase: Mapping[str, Sequence[ExplainedMoment]], command: str
 ) -> list[Section]:
     """Write the sections of several episodes: the verdict, then the numbers of each phase."""
-    sections = [verdict_section(sentences, "")]
+    values = {phase: [each.as_json() for each in moments] for phase, moments in by_phase.items()}
+    sections = [verdict_section(sentences, ""), Section("Effects", [], charts=[effects_chart(values)])]
     for phase, moments in by_phase.items():
         title = f"{phase.capitalize() or MIDDLE}: {len(moments)} episodes"
         sections.append(Section(title, [*_mean_tables(moments)], is_folded=True))
     return [*sections, Section("How it was made", [], [command], is_folded=True)]
+
+
+def effects_chart(by_phase: Mapping[str, Sequence[Values]]) -> Chart:
+    """Draw mean effects of objects and words with their intervals, phases side by side."""
+    effects = {
+        phase: [each for kind in (OBJECTS, WORDS) for each in effects_in_phase(moments, phase, kind)]
+        for phase, moments in by_phase.items()
+    }
+    names = [*dict.fromkeys(_label(each) for of_phase in effects.values() for each in of_phase)]
+    unit = next(each.unit for of_phase in effects.values() for each in of_phase) if names else ""
+    title = f"What changes when it is hidden, {unit}"
+
+    def paint(figure: "Figure") -> None:
+        grid = figure.subplots(1, len(effects), sharex=True, sharey=True, squeeze=False)
+        for axes, (phase, of_phase) in zip(grid[0], effects.items(), strict=True):
+            axes.set_title(phase or MIDDLE)
+            axes.set_yticks(range(len(names)), names)
+            axes.set_xlabel(unit)
+            for each in of_phase:
+                y = names.index(_label(each))
+                low, high = each.mean.interval or (each.mean.value, each.mean.value)
+                axes.plot([low, high], [y, y], color=COLORS[0], linewidth=1.5)
+                axes.plot(each.mean.value, y, "o", color=COLORS[0], markersize=5)
+            tidy(axes)
+        grid[0][0].invert_yaxis()
+
+    rows = [
+        [Cell(phase or MIDDLE), Cell(_label(each)), mean_cell(each.mean, ".3g")]
+        for phase, of_phase in effects.items()
+        for each in of_phase
+    ]
+    size = (2.2 + 1.9 * len(effects), 0.8 + 0.25 * len(names))
+    note = "Means over episodes with 95 % bootstrap intervals."
+    return Chart(title, draw(title, size, paint), [Table("", ["phase", "hidden", unit], rows)], note)
+
+
+def _label(effect: Effect) -> str:
+    return f"words: {effect.name}" if effect.kind == WORDS else effect.name
 
 
 def _mean_tables(moments: Sequence[ExplainedMoment]) -> Iterator[Table]:

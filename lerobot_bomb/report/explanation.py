@@ -101,7 +101,8 @@ def _masked(masked: Mapping[str, EpisodeRun], target_xy: Sequence[float] | None)
     chart = paths_chart(
         "Paths under masks", {f"{name} hidden": run for name, run in masked.items()}, target_xy
     )
-    drawn = f"<details><summary>{chart.title}</summary>{chart.svg}</details>"
+    figure = f'<figure><div class="wide" tabindex="0">{chart.svg}</div></figure>'
+    drawn = f"<details><summary>{escape(chart.title)}</summary>{figure}</details>"
     return Section("With something hidden in every step", [table], [], drawn, is_folded=True)
 
 

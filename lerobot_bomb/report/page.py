@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from html import escape
 
-from lerobot_bomb.report.chart import Chart, cut
+from lerobot_bomb.report.chart import Chart, shorten
 from lerobot_bomb.report.table import Cell, Section, Statement, Table
 
 # one hue in different strengths, which reads the same for the colour-blind
@@ -11,6 +11,7 @@ SHADE = "background:rgba(0,114,178,{:.2f})"
 MAX_STRENGTH = 0.55  # text stays readable on it, black or white
 MAX_UNBROKEN = 24  # characters of a cell that stay in one line, even where the table is too wide
 MAX_TEXT = 240  # characters of a name or cell that are shown; the rest is shown under the pointer
+MAX_SUBJECT = 60  # characters of the subject of a sentence
 MAX_HOVER = 6000  # characters shown under the pointer
 MAX_ROWS = 200  # of a table that the page shows; the files beside it have all
 STYLE = """
@@ -27,8 +28,8 @@ td.long{white-space:normal;overflow-wrap:anywhere;min-width:9rem}
 p.note{opacity:.75;max-width:60rem;font-size:.9rem}
 figure{margin:1rem 0}figure img{image-rendering:pixelated;margin-right:.3rem}
 figcaption{font-weight:600;font-size:1rem}
-figure svg{display:block;max-width:100%;min-width:34rem;height:auto}
-figure svg.full{max-width:none}
+figure svg{display:block;max-width:100%;height:auto}
+figure svg *{stroke-linejoin:round;stroke-linecap:butt}
 p.statement{max-width:60rem;margin:.5rem 0}
 h1,h2,h3,b,summary{overflow-wrap:anywhere}
 details{margin:.5rem 0}summary{cursor:pointer;opacity:.85}
@@ -46,8 +47,8 @@ def render(title: str, sections: Sequence[Section]) -> str:
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(cut(title, MAX_TEXT))}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        f"{heading}\n<nav>{links}</nav>\n{body}\n</body>\n</html>\n"
+        f"<title>{escape(shorten(title, MAX_TEXT))}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"{heading}\n<nav>{links}</nav>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
     )
 
 
@@ -65,14 +66,16 @@ def _section(section: Section) -> str:
 
 
 def _statement(statement: Statement) -> str:
-    return f'<p class="statement"><b>{_shown(statement.subject)}</b> {_shown(statement.text)}</p>'
+    return (
+        f'<p class="statement"><b>{_shown(statement.subject, MAX_SUBJECT)}</b> {escape(statement.text)}</p>'
+    )
 
 
 def _chart(chart: Chart) -> str:
     caption = f"<figcaption>{_shown(chart.title)}</figcaption>"
     note = f'<p class="note">{escape(chart.note)}</p>' if chart.note else ""
     numbers = _folded("The numbers", _tables(chart.tables)) if chart.tables else ""
-    return f'<figure>{caption}\n<div class="wide">{chart.svg}</div>{note}{numbers}</figure>'
+    return f'<figure>{caption}\n<div class="wide" tabindex="0">{chart.svg}</div>{note}{numbers}</figure>'
 
 
 def _folded(title: str, parts: list[str]) -> str:
@@ -88,11 +91,11 @@ def _tables(tables: Sequence[Table]) -> list[str]:
     return parts
 
 
-def _shown(text: str) -> str:
+def _shown(text: str, most: int = MAX_TEXT) -> str:
     """Escape a text; of a very long one, show the ends, and the rest under the pointer."""
-    if len(text) <= MAX_TEXT:
+    if len(text) <= most:
         return escape(text)
-    return f'<span title="{escape(text[:MAX_HOVER])}">{escape(cut(text, MAX_TEXT))}</span>'
+    return f'<span title="{escape(text[:MAX_HOVER])}">{escape(shorten(text, most))}</span>'
 
 
 def _table(table: Table, note: str) -> str:
@@ -106,7 +109,7 @@ def _table(table: Table, note: str) -> str:
     notes += [f"{left:,} more rows are in the JSON file beside this page."] if left > 0 else []
     below = "".join(f'\n<p class="note">{escape(each)}</p>' for each in notes)
     grid = f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
-    return f'{title}<div class="wide">{grid}</div>{below}'
+    return f'{title}<div class="wide" tabindex="0">{grid}</div>{below}'
 
 
 def _is_text(table: Table, column: int) -> bool:
