@@ -20,12 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PANEL_INCHES = 1.9
-KINDS = (
-    "hidden patch",
-    "hidden words",
-    "other words",
-    "other scene",
-)  # of corruptions, as rows of the figure
+# of corruptions: rows of the figure
+KINDS = ("hidden patch", "hidden words", "other words", "other scene")
 
 
 def maps_html(moments: Sequence[ExplainedMoment]) -> str:
