@@ -27,7 +27,7 @@ def test_one_episode(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[st
     found = json.loads((output / "explanation.json").read_text())
     phases = [moment["phase"] for moment in found["moments"]]
     assert phases == ["reach", "grasp", "carry", "place"]
-    assert printed.startswith("\n".join(found["verdict"])) and "It succeeded after" in found["verdict"][0]
+    assert "\n".join(found["verdict"]) in printed and "It succeeded after" in found["verdict"][0]
     for moment in found["moments"]:
         assert {len(grid) for grid in moment["patches"].values()} == {4}
         assert moment["words"]["row and column"] is not None
