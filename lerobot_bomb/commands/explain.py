@@ -206,9 +206,10 @@ def _explain_several(args: argparse.Namespace, query: _Query) -> int:
     sentences = verdict(numbers)
     sections = aggregate_sections(sentences, by_phase, _command())
     if probes := _probes([moments[0] for moments, _ in episodes]):
-        sections.append(probes_section(probes))
+        sections.insert(-1, probes_section(probes))
     told = {"verdict": sentences, "sections": [each.as_json() for each in sections], "episodes": numbers}
-    title = f"What does it depend on? {query.viewed(query.seed).group}, {args.episodes} episodes"
+    what = f"{loaded.config.type}, {query.viewed(query.seed).group}"
+    title = f"What does it depend on? {what}, {args.episodes} episodes"
     with written_whole(args.output) as (folder,):
         _write(folder, title, sections, told)
     print(*sentences, *(args.output / file for file in (PAGE, NUMBERS)), sep="\n")

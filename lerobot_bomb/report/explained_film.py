@@ -24,7 +24,7 @@ SIZE_INCHES = (7.6, 4.4)
 LABEL_M = 0.022  # of the numbers beside the board, beyond its outer lines
 LABEL_SCALE = 0.6
 DASHES = ("-", "--", ":", "-.")
-SHOWN = "width:min(14rem,43vw)"  # of a picture: two beside each other on a phone
+SHOWN = "width:min(14rem,40vw)"  # of a picture: two beside each other on a phone
 END_COLOR = COLORS[5]
 
 

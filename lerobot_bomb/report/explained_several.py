@@ -1,6 +1,7 @@
 """Explanations of several episodes as a page: means with intervals, phase by phase."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,10 +30,12 @@ def aggregate_sections(
     """Write the sections of several episodes: the verdict, then the numbers of each phase."""
     values = {phase: [each.as_json() for each in moments] for phase, moments in by_phase.items()}
     sections = [verdict_section(sentences, ""), Section("Effects", [], charts=[effects_chart(values)])]
-    for phase, moments in by_phase.items():
-        title = f"{phase.capitalize() or MIDDLE}: {len(moments)} episodes"
-        sections.append(Section(title, [*_mean_tables(moments)], is_folded=True))
-    return [*sections, Section("How it was made", [], [command], is_folded=True)]
+    tables = [
+        replace(table, title=f"{phase.capitalize() or MIDDLE}, {len(moments)} episodes: {table.title}")
+        for phase, moments in by_phase.items()
+        for table in _mean_tables(moments)
+    ]
+    return [*sections, Section("All numbers", tables, [command], is_folded=True)]
 
 
 def effects_chart(by_phase: Mapping[str, Sequence[Values]]) -> Chart:

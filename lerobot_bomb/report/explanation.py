@@ -71,11 +71,10 @@ def _happened(
         charts = [paths_chart("Paths over the board", runs, target_xy)]
     tables = []
     if counterfactuals:
-        rows = [[Cell(each.name), *_outcome(each.run)] for each in counterfactuals]
+        runs = {"this episode": run} | {each.name: each.run for each in counterfactuals}
+        rows = [[Cell(name), *_outcome(each)] for name, each in runs.items()]
         tables = [Table("The same seed under fewer perturbations", ["episode", *OUTCOME], rows)]
-    return Section(
-        "What happened", tables, [], counterfactual_html(run, settled), charts=charts, is_folded=bool(tables)
-    )
+    return Section("What happened", tables, [], counterfactual_html(run, settled), charts=charts)
 
 
 def _outcome(run: EpisodeRun) -> list[Cell]:
