@@ -44,8 +44,8 @@ def test_one_that_never_looked_at_the_stone() -> None:
         moment("carry", mm=seen(stone=0.2, board=2.0, gripper=6.0) | {"words": words}),
     ]
     assert reasons(moments) == [
-        "It never looked at the stone: hiding it changes the next action by at most 0.3 mm, hiding the board "
-        "by 14.0 mm at reach.",
+        "In the 2 steps examined, it never looked at the stone: hiding it changes the next action by at most "
+        "0.3 mm, hiding the board by 14.0 mm at reach.",
         "It looks at the board (14.0 mm at reach) and the gripper (6.0 mm at carry): so much the next action "
         "moves when that is hidden.",
         "Of the instruction, only the words for row and column (18.5 mm at carry) decide; no other word does "

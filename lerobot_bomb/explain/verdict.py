@@ -52,7 +52,8 @@ def _endings(episodes: Sequence[Values]) -> Iterator[str]:
 def reasons(moments: Sequence[Values]) -> list[str]:
     """Return what the policy's actions depend on in these moments, sentence by sentence."""
     objects, patches = effects_of(moments, OBJECTS), effects_of(moments, PATCHES)
-    seen = _objects(objects) if objects else _patches(patches)
+    steps = "the one step examined" if len(moments) == 1 else f"the {len(moments)} steps examined"
+    seen = _objects(objects, steps) if objects else _patches(patches)
     words = _words(effects_of(moments, WORDS), objects or patches)
     return [*seen, *words, *_followed(moments), *_pointing(moments), *_heads(moments)]
 
@@ -68,7 +69,7 @@ def _thing(name: str) -> str:
     return {"target": "the target intersection", "other stones": "the other stones"}.get(name, f"the {name}")
 
 
-def _objects(effects: Sequence[Effect]) -> Iterator[str]:
+def _objects(effects: Sequence[Effect], steps: str) -> Iterator[str]:
     """Yield what it looks at and what it never looked at; the latter first if that is the stone."""
     used = [each for each in effects if each.matters]
     unsure = [each for each in effects if each.is_open]
@@ -89,7 +90,7 @@ def _objects(effects: Sequence[Effect]) -> Iterator[str]:
         largest = _changed(max(unused, key=lambda each: each.size))
         it = "it" if len(unused) == 1 else "any of these"
         beside = f"hiding {_thing(used[0].name)} by {used[0].evidence}"
-        never = f"It never looked at {names}: hiding {it} {largest}, {beside}."
+        never = f"In {steps}, it never looked at {names}: hiding {it} {largest}, {beside}."
     is_blind = bool(unused) and unused[0].name == STONE
     yield from (each for each in ((never, first) if is_blind else (first, never)) if each)
     if unsure:
