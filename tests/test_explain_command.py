@@ -1,5 +1,6 @@
 """``lerobot-bomb explain``: pages of one episode and of several."""
 
+import html
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -23,21 +24,28 @@ def test_one_episode(policy_type: str, tmp_path: Path, capsys: pytest.CaptureFix
     found = json.loads((output / "explanation.json").read_text())
     phases = [moment["phase"] for moment in found["moments"]]
     assert phases == ["reach", "grasp", "carry", "place"]
-    assert all(phase in printed for phase in phases)
+    assert "\n".join(found["verdict"]) in printed and "It succeeded after" in found["verdict"][0]
     for moment in found["moments"]:
         assert {len(grid) for grid in moment["patches"].values()} == {4}
         assert moment["words"]["row and column"] is not None
         assert {len(each["mlps"]) for each in moment["restored"]} == {2}
         assert "pointing" not in moment and "It points at:" not in moment["findings"]
+        assert {len(grid) for grid in moment["moved_mm"]["patches"].values()} == {4}
+        assert moment["moved_mm"]["objects"].keys() == moment["objects"].keys()
     page = (output / "explanation.html").read_text()
-    assert page.count("<img ") == 3 * 2 * len(phases) and "<script" not in page and "http" not in page
+    # the maps, and the pictures of start, grasp and end
+    assert page.count("<img ") == 2 * len(phases) + 3 and "<script" not in page
+    assert all(html.escape(sentence) in page for sentence in found["verdict"])
+    assert "http" not in page.replace("http://www.w3.org/1999/xlink", "")
     masked = found["masked_episodes"]
     assert masked["nothing"]["is_success"] and not masked["the whole instruction"]["is_success"]
-    assert masked["nothing"] == found["result"]
+    assert masked["nothing"] == found["result"] and found["counterfactuals"] == []
+    assert len(found["gripper_xy_m"]) == found["result"]["steps"] + 1
+    assert found["masked_paths"]["nothing"]["gripper_xy_m"] == found["gripper_xy_m"]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("number", "last"), [(2, "Phase: place"), (10, "Where is the destination known?")])
+@pytest.mark.parametrize(("number", "last"), [(2, "Effects"), (10, "Where is the destination known?")])
 def test_several_episodes(number: int, last: str, tmp_path: Path) -> None:
     output = tmp_path / "why"
     flags = ["--policy.path=bomb:fdvla", "--seed=100000", "--grid=2", f"--output={output}"]
@@ -45,10 +53,18 @@ def test_several_episodes(number: int, last: str, tmp_path: Path) -> None:
     assert {path.name for path in output.iterdir()} == {"explanation.html", "explanation.json"}
     found = json.loads((output / "explanation.json").read_text())
     titles = [section["title"] for section in found["sections"]]
-    assert titles[:2] == ["In short", "Phase: reach"] and titles[-1] == last
-    assert len(found["episodes"]) == number
-    came = found["sections"][0]["tables"][0]["rows"]
-    assert [row[1] for row in came] == [number] * 4 and "failures: none" in found["sections"][0]["lines"]
+    assert titles[:2] == ["Verdict", "Effects"]
+    named = {table["title"].partition(":")[0] for table in found["sections"][-1]["tables"]}
+    assert named == {f"{phase}, {number} episodes" for phase in ("Reach", "Grasp", "Carry", "Place")}
+    assert titles[-2:] == [last, "All numbers"] and len(found["episodes"]) == number
+    assert found["verdict"][0].startswith(f"Success: {number}/{number} = 100.0 % [")
+    assert "the stone (" in found["verdict"][1] and " mm [" in found["verdict"][1]
+    moments = [moment for each in found["episodes"] for moment in each["moments"]]
+    reached = [
+        each["moved_mm"]["objects"]["all cameras"]["stone"] for each in moments if each["phase"] == "reach"
+    ]
+    drawn = {(row[0], row[1]): row[2] for row in found["sections"][1]["charts"][0]["tables"][0]["rows"]}
+    assert drawn["reach", "stone"]["value"] == pytest.approx(sum(reached) / number)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +107,7 @@ def test_the_episode_of_a_line(
     assert main(["explain", *flags]) == 0
     found = json.loads((output / "explanation.json").read_text())
     assert found["moments"][0]["instruction"] == row["instruction"]
-    assert found["result"]["spec"] == row["spec"]
+    assert found["result"]["spec"] == row["spec"] and found["recorded"] == row
     for wrong, message in (
         ("--line=2", "--line=2 is no episode of"),
         ("--line=0", "--line=0 is no episode of"),

@@ -2,7 +2,8 @@
 
 import math
 import re
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,13 +12,15 @@ from explain_cases import NAMES, SPEC, loaded, moment
 
 from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.explain.aggregate import mean_of, means_of
+from lerobot_bomb.explain.counterfactuals import conditions_without
 from lerobot_bomb.explain.diagnosis import used
-from lerobot_bomb.explain.images import filling, occluded, patch_masks, smoothed
-from lerobot_bomb.explain.masked_episodes import MaskedEpisode
+from lerobot_bomb.explain.film import EpisodeRun
+from lerobot_bomb.explain.images import filling, occluded, patch_masks
+from lerobot_bomb.explain.maps import tinted
 from lerobot_bomb.explain.moment import Explanation
 from lerobot_bomb.explain.probes import probe_classes, probe_values
 from lerobot_bomb.explain.spans import difference, named_spans, span_of, spans_of_words, token_offsets
-from lerobot_bomb.report.explanation import traces_svg
+from lerobot_bomb.report.explained_film import paths_chart
 
 pytestmark = pytest.mark.usefixtures("loaded_policies")
 
@@ -100,10 +103,6 @@ def test_fillings() -> None:
     assert (changed != image).any(dim=0).nonzero().tolist() == [[3, 4]]
 
 
-def test_a_smoothed_map_keeps_its_mean() -> None:
-    assert float(smoothed(torch.ones(2, 2), 8, 8).mean()) == pytest.approx(1)
-
-
 def test_a_probe_finds_what_is_there_and_nothing_in_noise() -> None:
     rng = np.random.default_rng(0)
     labels = rng.integers(5, size=200)
@@ -172,11 +171,32 @@ def test_other_instructions_differ_in_one_word_and_name_their_intersection() -> 
         assert intersection == expected.get(word, (row, column))
 
 
-def test_every_trace_has_a_look_of_its_own_which_the_legend_shows() -> None:
-    trace = MaskedEpisode(np.zeros((2, 3)), None)  # pyright: ignore[reportArgumentType]
-    svg = traces_svg({f"mask {number}": trace for number in range(20)})
-    of_traces, of_legend = (
-        re.findall(rf"<{kind} [^>]*(stroke=[^>]*)/>", svg) for kind in ("polyline", "line")
-    )
-    assert len(set(of_legend)) == 20 and of_traces[-20:] == of_legend
-    assert [look for look in of_legend if "currentColor" in look] == of_legend[:1]
+def test_every_path_has_a_look_of_its_own_and_the_numbers_are_in_a_table() -> None:
+    ended = cast("Any", SimpleNamespace(is_success=False, failure="dropped"))
+    runs = {
+        f"mask {number}": EpisodeRun(ended, np.full((3, 3), 0.01 * number), np.full((3, 3), 0.02), {})
+        for number in range(20)
+    }
+    chart = paths_chart("Paths", runs, (0.0, 0.045))
+    looks = set(re.findall(r'style="fill: none; stroke[^"]*"', chart.svg))
+    assert len(looks) > 20 and all(name in chart.svg for name in runs)
+    (table,) = chart.tables
+    assert [cell.value or cell.text for cell in table.rows[1]] == ["mask 1", "failed, dropped", "2", 20, 20]
+
+
+def test_conditions_without_an_axis_keep_the_levels_that_were_drawn() -> None:
+    assert [*conditions_without({"camera": 2, "light": 0, "object": 4})] == [
+        (("camera",), "object:4"),
+        (("object",), "camera:2"),
+        (("camera", "object"), "none"),
+    ]
+    assert [*conditions_without({"camera": 2})] == [(("camera",), "none")]
+    assert [*conditions_without({"camera": 0})] == []
+
+
+def test_a_map_tints_an_image_where_the_effect_is() -> None:
+    image = np.full((4, 4, 3), 100, np.uint8)
+    shown = tinted(np.array([[0.0, 2.0], [-1.0, 1.0]]), 2.0, image)
+    assert shown[0, 0].tolist() == shown[3, 0].tolist() == [100, 100, 100]
+    assert shown[0, 3].tolist() == [185, 96, 25] and shown[3, 3].tolist() == [142, 98, 62]
+    assert tinted(np.zeros((2, 2)), 0.0, image).tolist() == image.tolist()

@@ -9,10 +9,11 @@ from explain_cases import FAST_NAMES, GRID, WORKSPACE, WRIST, ask, fresh, moment
 
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.explain.diagnosis import diagnose
+from lerobot_bomb.explain.limits import smallest_drop
 from lerobot_bomb.explain.moment import OTHER_SCENE, Explanation, camera_name, explain
-from lerobot_bomb.explain.restoration import smallest_drop
 from lerobot_bomb.explain.scored_policy import INSTRUCTION
 from lerobot_bomb.explain.spans import difference, span_of, token_offsets
+from lerobot_bomb.explain.verdict import reasons
 from lerobot_bomb.flow.dual_mod import FiLM
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 
@@ -21,6 +22,11 @@ HEADS = {"vla0_smol": (0, 2), "spatialvla_grid": (0, 3), "fdvla": (0, 2)}  # lay
 
 def findings(explanation: Explanation) -> dict[str, tuple[str, ...]]:
     return {each.question: each.names for each in diagnose(explanation)}
+
+
+def told(explanation: Explanation) -> str:
+    """Return the sentences of the verdict about one moment."""
+    return " ".join(reasons([{"phase": "carry", "following": {}, **explanation.as_json()}]))
 
 
 def hide_words(policy: LoadedPolicy, shown: torch.Tensor | None) -> None:
@@ -41,7 +47,9 @@ def hide_words(policy: LoadedPolicy, shown: torch.Tensor | None) -> None:
 def test_one_that_ignores_the_text(name: str) -> None:
     policy = fresh(name)
     hide_words(policy, None)
-    found = findings(explain(ask(policy), query(policy)))
+    explanation = explain(ask(policy), query(policy))
+    assert "It does not read the instruction: hiding or changing any of its words" in told(explanation)
+    found = findings(explanation)
     assert found["Hidden words that the answer depends on:"] == ()
     assert found["Changed words that the answer depends on:"] == ()
     assert found["Patches that the answer depends on:"]
@@ -68,7 +76,10 @@ def test_one_that_reads_only_the_column(name: str) -> None:
     span = difference("column", instruction, others["column"][0])
     assert span is not None
     hide_words(policy, span.tokens(token_offsets(policy.prepare.steps, instruction)))
-    found = findings(explain(ask(policy), query(policy)))
+    explanation = explain(ask(policy), query(policy))
+    assert "Of the instruction, only the word for column (" in told(explanation)
+    assert "no other word does (at most " in told(explanation)
+    found = findings(explanation)
     assert found["Hidden words that the answer depends on:"] == ("column",)
     assert found["Changed words that the answer depends on:"] == ("column",)
 
@@ -90,7 +101,10 @@ def test_one_that_looks_at_one_patch_only(name: str, camera: str) -> None:
             changed[key] = shown
         return policy.prepare(changed)
 
-    found = findings(explain(ask(policy, prepare), query(policy)))
+    explanation = explain(ask(policy, prepare), query(policy))
+    only = f"Of all image patches, only {camera_name(camera)} patch {line}, {column} matters ("
+    assert only in told(explanation)
+    found = findings(explanation)
     assert found["Patches that the answer depends on:"] == (f"{camera_name(camera)} patch {line}, {column}",)
 
 
@@ -108,7 +122,10 @@ def test_one_that_reads_the_target_through_one_head(name: str) -> None:
         for head in range(layer.num_heads):
             if (number, head) != of_target:
                 weight.data[:, head * size : (head + 1) * size] = 0
-    found = findings(explain(ask(policy), query(policy)))
+    explanation = explain(ask(policy), query(policy))
+    only = "One head alone carries the instruction at carry: layer {}, head {} (".format(*of_target)
+    assert only in told(explanation)
+    found = findings(explanation)
     named = [names for question, names in found.items() if "other instruction" in question]
     assert named == [("layer {}, head {}".format(*of_target),)]
 

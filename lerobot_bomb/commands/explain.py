@@ -7,6 +7,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,11 +23,13 @@ from lerobot_bomb.conditions import NONE
 from lerobot_bomb.environments import BOMB
 from lerobot_bomb.files import check_new_folder, written_whole
 from lerobot_bomb.flags import one_of
+from lerobot_bomb.results.record import Record
 from lerobot_bomb.viewing.episode import Viewed
 from lerobot_bomb.viewing.replay import Replay
 
 if TYPE_CHECKING:
     from lerobot_bomb.explain.episode import ExplainedMoment
+    from lerobot_bomb.explain.film import EpisodeRun
     from lerobot_bomb.explain.probes import LayerProbe
     from lerobot_bomb.report.table import Section
     from lerobot_bomb.viewing.checkpoint import LoadedPolicy
@@ -61,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Explain episodes: print the findings; write a page, its numbers and, for one episode, a recording."""
+    """Explain episodes: print the verdict; write a page, its numbers and, for one episode, a recording."""
     check_at_least(args, episodes=1, grid=1)
     if args.episodes > 1 and args.step is not None:
         raise ValueError(f"--step={args.step} is of one episode; drop it or --episodes={args.episodes}")
@@ -85,8 +88,9 @@ def _of_flags(args: argparse.Namespace) -> "_Query":
     if args.line is not None:
         raise ValueError(f"--line={args.line} is of --results=FILE; drop it, or name the file")
 
-    def viewed(seed: int) -> Viewed:
-        return viewed_of(argparse.Namespace(**vars(args) | {"seed": seed}))
+    def viewed(seed: int, perturbations: str | None = None) -> Viewed:
+        changed = {} if perturbations is None else {"perturbations": (perturbations,)}
+        return viewed_of(argparse.Namespace(**vars(args) | {"seed": seed} | changed))
 
     seed = TEST_SEEDS[0] if args.seed is None else args.seed
     return _Query(viewed, seed, args.policy_path, args.policy_device)
@@ -104,17 +108,23 @@ def _of_record(args: argparse.Namespace) -> "_Query":
         raise ValueError("this record's policy has no checkpoint, so there is nothing to explain")
     check_checkpoint(replay.checkpoint)
     seed = replay.record.spec.seed if args.seed is None else args.seed
-    return _Query(lambda seed: replay.viewed(seed=seed), seed, replay.checkpoint, args.policy_device)
+    recorded = replay.record if seed == replay.record.spec.seed else None
+
+    def viewed(seed: int, perturbations: str | None = None) -> Viewed:
+        return replay.viewed(perturbations, seed)
+
+    return _Query(viewed, seed, replay.checkpoint, args.policy_device, recorded)
 
 
 @dataclass(frozen=True)
 class _Query:
     """Episodes and checkpoint to explain."""
 
-    viewed: Callable[[int], Viewed]  # of a seed
+    viewed: Callable[..., Viewed]  # of a seed, and of other perturbations than its own
     seed: int
     checkpoint: Path
     device: str | None
+    recorded: Record | None = None  # of this episode, before
 
     def load(self) -> "LoadedPolicy":
         from lerobot_bomb.viewing.checkpoint import load_policy  # LeRobot and torch: seconds
@@ -125,13 +135,13 @@ class _Query:
 
 def _moments(
     args: argparse.Namespace, query: _Query, seed: int, loaded: "LoadedPolicy"
-) -> "tuple[list[ExplainedMoment], Any]":
-    """Explain the chosen moments of an episode; return them with the episode's result."""
+) -> "tuple[list[ExplainedMoment], EpisodeRun]":
+    """Explain the chosen moments of an episode; return them with the episode as it ran."""
     from lerobot_bomb.explain.episode import Settings, explain_moment
     from lerobot_bomb.explain.snapshots import at_step, middle_of_phases, take_snapshots
 
     viewed = query.viewed(seed)
-    snapshots, result = take_snapshots(viewed, loaded)
+    snapshots, run = take_snapshots(viewed, loaded)
     chosen = middle_of_phases(snapshots) if args.step is None else [at_step(snapshots, args.step)]
     elsewhere = take_snapshots(query.viewed(seed + 1), loaded)[0]
     others = {each.phase: each for each in (elsewhere[0], *middle_of_phases(elsewhere))}
@@ -141,39 +151,47 @@ def _moments(
     return [
         explain_moment(loaded, each, settings, control_mode, others.get(each.phase, elsewhere[0]))
         for each in moments
-    ], result
+    ], run
 
 
 def _explain_one(args: argparse.Namespace, query: _Query) -> int:
+    from lerobot_bomb.explain.counterfactuals import run_counterfactuals
     from lerobot_bomb.explain.masked_episodes import masks_of, run_masked
     from lerobot_bomb.explain.recording import write_recording
-    from lerobot_bomb.report.explanation import moment_sections, overview_section, traces_section
+    from lerobot_bomb.explain.verdict import verdict
+    from lerobot_bomb.report.explanation import episode_sections
 
     viewed, loaded = query.viewed(query.seed), query.load()
-    moments, result = _moments(args, query, query.seed, loaded)
-    episodes = {}
+    moments, run = _moments(args, query, query.seed, loaded)
+    masked = {}
     if moments[0].snapshot.objects and args.fill != "other":
-        episodes = run_masked(viewed, loaded, masks_of(moments[0].snapshot, loaded, args.fill))
-    name = viewed.name(loaded.config.type)
-    sections = [overview_section(viewed.log.describe(result), moments, _command())]
-    sections += [section for each in moments for section in moment_sections(each)]
-    sections += [traces_section(episodes)] if episodes else []
+        masked = run_masked(viewed, loaded, masks_of(moments[0].snapshot, loaded, args.fill))
+    counterfactuals = run_counterfactuals(run.result, partial(query.viewed, query.seed), loaded)
     numbers = {
-        "result": result.as_json(),
+        "result": run.result.as_json(),
+        "recorded": None if query.recorded is None else query.recorded.as_json(),
         "moments": [each.as_json() for each in moments],
-        "masked_episodes": {mask: episode.result.as_json() for mask, episode in episodes.items()},
+        "masked_episodes": {mask: each.result.as_json() for mask, each in masked.items()},
+        "masked_paths": {mask: each.paths for mask, each in masked.items()},
+        "counterfactuals": [each.as_json() for each in counterfactuals],
+        **run.paths,
     }
+    sentences = verdict([numbers])
+    sections = episode_sections(sentences, moments, run, masked, counterfactuals, _command())
+    name = viewed.name(loaded.config.type)
+    question = "Why did it succeed?" if run.result.is_success else "Why did it fail?"
+    spec, task = viewed.spec, viewed.group.partition(".")[0]
+    title = f"{question} {loaded.config.type}, {task}, {spec.perturbations}, seed {spec.seed}"
     with written_whole(args.output) as (folder,):
-        _write(folder, f"Why: {name}", sections, numbers)
+        _write(folder, title, sections, {"verdict": sentences, **numbers})
         write_recording(folder / RECORDING, name, viewed.fps, moments)
-    for each in moments:
-        print(each.title, *(f"  {finding}" for finding in each.findings), sep="\n")
-    print(*(args.output / file for file in (PAGE, NUMBERS, RECORDING)), sep="\n")
+    print(*sentences, *(args.output / file for file in (PAGE, NUMBERS, RECORDING)), sep="\n")
     return 0
 
 
 def _explain_several(args: argparse.Namespace, query: _Query) -> int:
-    from lerobot_bomb.report.explanation import aggregate_sections, probes_section
+    from lerobot_bomb.explain.verdict import verdict
+    from lerobot_bomb.report.explained_several import aggregate_sections, probes_section
 
     loaded, seeds = query.load(), range(query.seed, query.seed + args.episodes)
     episodes = [_moments(args, query, seed, loaded) for seed in tqdm(seeds, desc="episodes")]
@@ -181,19 +199,20 @@ def _explain_several(args: argparse.Namespace, query: _Query) -> int:
     for moments, _ in episodes:
         for each in moments:
             by_phase[each.snapshot.phase].append(each)
-    sections = aggregate_sections([result for _, result in episodes], by_phase, _command())
+    numbers = [
+        {"result": run.result.as_json(), "moments": [each.as_json() for each in moments]}
+        for moments, run in episodes
+    ]
+    sentences = verdict(numbers)
+    sections = aggregate_sections(sentences, by_phase, _command())
     if probes := _probes([moments[0] for moments, _ in episodes]):
-        sections.append(probes_section(probes))
-    numbers = {
-        "sections": [section.as_json() for section in sections],
-        "episodes": [
-            {"result": result.as_json(), "moments": [each.as_json() for each in moments]}
-            for moments, result in episodes
-        ],
-    }
+        sections.insert(-1, probes_section(probes))
+    told = {"verdict": sentences, "sections": [each.as_json() for each in sections], "episodes": numbers}
+    what = f"{loaded.config.type}, {query.viewed(query.seed).group}"
+    title = f"What does it depend on? {what}, {args.episodes} episodes"
     with written_whole(args.output) as (folder,):
-        _write(folder, f"Why: {query.viewed(query.seed).group}, {args.episodes} episodes", sections, numbers)
-    print(*(args.output / file for file in (PAGE, NUMBERS)), sep="\n")
+        _write(folder, title, sections, told)
+    print(*sentences, *(args.output / file for file in (PAGE, NUMBERS)), sep="\n")
     return 0
 
 

@@ -4,12 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self
 
-from lerobot_bomb.explain.moment import ALL, Explanation, PatchingResult, camera_name
-from lerobot_bomb.explain.restoration import smallest_drop
+from lerobot_bomb.explain.limits import ALL, RESTORES, SHARE, smallest_drop
+from lerobot_bomb.explain.moment import Explanation, PatchingResult, camera_name
 
-SHARE = 0.05  # an effect below this share of the largest of its kind is none
 MAX_NAMES = 6  # that are shown
-RESTORES = 0.5  # share of the drop that a head alone must restore to be named
 
 
 @dataclass(frozen=True)

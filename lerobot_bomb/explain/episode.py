@@ -12,7 +12,8 @@ from lerobot_bomb.checkpoints.folder import autocast
 from lerobot_bomb.explain.activations import LAYER, recording
 from lerobot_bomb.explain.diagnosis import Finding, diagnose
 from lerobot_bomb.explain.following import Following, following
-from lerobot_bomb.explain.moment import OBSERVATION, Explanation, MomentQuery, explain, image_keys
+from lerobot_bomb.explain.moment import OBSERVATION, Explanation, MomentQuery, explain, finite, image_keys
+from lerobot_bomb.explain.next_actions import NextActions
 from lerobot_bomb.explain.other_policies import scored
 from lerobot_bomb.explain.pointing import PointingCheck, check_pointing
 from lerobot_bomb.explain.question import Question
@@ -53,9 +54,10 @@ class ExplainedMoment:
         return {
             "step": self.snapshot.step,
             "phase": self.snapshot.phase,
+            "does": self.snapshot.does,
             "instruction": self.snapshot.instruction,
             "findings": {each.question: each.names for each in self.findings},
-            "following": {word: asdict(each) for word, each in self.followings.items()},
+            "following": finite({word: asdict(each) for word, each in self.followings.items()}),
             **({} if self.pointing is None else {"pointing": self.pointing.as_json()}),
             **self.explanation.as_json(),
         }
@@ -70,16 +72,18 @@ def explain_moment(
 ) -> ExplainedMoment:
     """Explain a moment; ``other``: a moment of another episode, whose scene may replace this one's.
 
-    ``control_mode``: of BOMB's actions; None elsewhere, where following is not measured.
+    ``control_mode``: of BOMB's actions; None elsewhere, where no action is a distance.
     """
     observation = loaded.observe([snapshot.observation], [snapshot.instruction])
     instead = loaded.observe([other.observation], [other.instruction])
+    policy = scored(loaded.policy, loaded.postprocess)
+    actions = None if control_mode is None else NextActions(loaded, policy, observation, control_mode)
     with torch.no_grad(), autocast(loaded.config):
-        question = Question(scored(loaded.policy, loaded.postprocess), loaded.prepare, observation)
-        explanation = explain(question, _query(loaded, snapshot, settings, instead))
+        question = Question(policy, loaded.prepare, observation)
+        explanation = explain(question, _query(loaded, snapshot, settings, instead), actions)
     followings = {}
-    if snapshot.target is not None and control_mode is not None:
-        followings = following(loaded, observation, snapshot.others, snapshot.target, control_mode)
+    if snapshot.target is not None and actions is not None:
+        followings = following(actions, snapshot.others, snapshot.target)
     images = {
         key: (255 * observation[key][0].permute(1, 2, 0)).round().to(torch.uint8).cpu().numpy()
         for key in image_keys(question)

@@ -6,9 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, Intersection
-from lerobot_bomb.bomb.observation import reach_m
-from lerobot_bomb.explain.scored_policy import Batch
-from lerobot_bomb.viewing.checkpoint import LoadedPolicy
+from lerobot_bomb.explain.next_actions import NextActions
 
 
 @dataclass(frozen=True)
@@ -22,28 +20,14 @@ class Following:
 
 
 def following(
-    loaded: LoadedPolicy,
-    observation: Batch,
-    others: Mapping[str, tuple[str, Intersection]],
-    target: Intersection,
-    control_mode: str,
+    actions: NextActions, others: Mapping[str, tuple[str, Intersection]], target: Intersection
 ) -> dict[str, Following]:
     """Measure how actions follow each of the other instructions, from the same observation and noise."""
-    clean = _end_xy(loaded, observation, control_mode)
     found = {}
     for word, (instruction, intersection) in others.items():
-        moved = _end_xy(loaded, {**observation, "task": [instruction]}, control_mode) - clean
+        moved = (actions.reached_m({"task": [instruction]}) - actions.clean_m)[:2]
         asked = BOARD.intersection_xy(*intersection) - BOARD.intersection_xy(*target)
         asked_m = float(np.linalg.norm(asked))
         along_m = float(moved @ asked) / asked_m if asked_m else np.nan
         found[word] = Following(instruction, 1e3 * asked_m, 1e3 * float(np.linalg.norm(moved)), 1e3 * along_m)
     return found
-
-
-def _end_xy(loaded: LoadedPolicy, observation: Batch, control_mode: str) -> np.ndarray:
-    """(2,) metres where the next actions lead, from where the gripper is or in the world's frame."""
-    loaded.begin()
-    prepared = loaded.prepare(observation)
-    num_steps = getattr(loaded.config, "n_action_steps", 1)
-    actions = np.concatenate([loaded.act(prepared) for _ in range(num_steps)])
-    return reach_m(actions, control_mode)[:2]

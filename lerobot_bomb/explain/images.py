@@ -52,10 +52,3 @@ def filling(image_3HW: Tensor, kind: str, blur_px: float, other_3HW: Tensor | No
 def occluded(image_3HW: Tensor, masks_MHW: Tensor, filling_3HW: Tensor) -> Tensor:
     """(M, 3, H, W) copies of the image, each without the pixels of one mask."""
     return torch.where(masks_MHW[:, None], filling_3HW, image_3HW)
-
-
-def smoothed(map_GG: Tensor, height: int, width: int) -> Tensor:
-    """(G, G) a value for each cell of a grid -> (H, W), interpolated."""
-    return torch.nn.functional.interpolate(
-        map_GG[None, None], size=(height, width), mode="bicubic", align_corners=False
-    )[0, 0]

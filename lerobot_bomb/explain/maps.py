@@ -8,26 +8,23 @@ import base64
 import cv2
 import numpy as np
 
-HEAT_SHARE = 0.6  # of an overlay that is the map
+TINT_RGB = (213, 94, 0)  # seen by the colour-blind (Okabe and Ito)
+STRENGTH = 0.75  # of the tint where the effect is largest
 
 
-def heat(values: np.ndarray, largest: float) -> np.ndarray:
-    """(H, W) -> (H, W, 3) uint8 RGB, dark at 0 and below, bright at the largest, in Cividis' colours."""
-    scaled = np.clip(values / largest, 0, 1) if largest > 0 else np.zeros_like(values)
-    colors = cv2.applyColorMap((255 * scaled).astype(np.uint8), cv2.COLORMAP_CIVIDIS)
-    return cv2.cvtColor(colors, cv2.COLOR_BGR2RGB)
+def strength(effect: float, largest: float) -> float:
+    """Return how strongly an effect is coloured: 0 for none or a negative one, STRENGTH for the largest."""
+    return STRENGTH * min(max(effect / largest, 0.0), 1.0) if largest > 0 else 0.0
 
 
-def cells(map_GG: np.ndarray, largest: float, height: int, width: int) -> np.ndarray:
-    """(H, W, 3) uint8, each cell in one colour."""
-    return cv2.resize(heat(map_GG, largest), (width, height), interpolation=cv2.INTER_NEAREST)
-
-
-def overlay(map_GG: np.ndarray, largest: float, image: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8, the map interpolated over the image."""
+def tinted(map_GG: np.ndarray, largest: float, image: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8: the image, each cell of the map the more tinted the larger its effect."""
+    shares = STRENGTH * np.clip(map_GG / largest, 0, 1) if largest > 0 else np.zeros_like(map_GG)
     height, width = image.shape[:2]
-    smooth = cv2.resize(map_GG.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
-    return cv2.addWeighted(heat(smooth, largest), HEAT_SHARE, image, 1 - HEAT_SHARE, 0)
+    size = (width, height)
+    shares_HW = cv2.resize(shares.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)[..., None]
+    grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
+    return ((1 - shares_HW) * grey + shares_HW * np.array(TINT_RGB)).round().astype(np.uint8)
 
 
 def png_bytes(image: np.ndarray) -> bytes:

@@ -10,14 +10,13 @@ import numpy as np
 import torch
 from lerobot.utils.constants import OBS_IMAGES
 
-from lerobot_bomb.bomb.observation import AGENT_POS
 from lerobot_bomb.envs.rollout import run_episode
+from lerobot_bomb.explain.film import EpisodeRun, Film
 from lerobot_bomb.explain.images import filling, occluded
 from lerobot_bomb.explain.other_policies import scored
 from lerobot_bomb.explain.scored_policy import Batch
 from lerobot_bomb.explain.snapshots import Snapshot
 from lerobot_bomb.explain.spans import TOKENIZERS, Span, named_spans, token_offsets, whole
-from lerobot_bomb.results.record import Record
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 from lerobot_bomb.viewing.episode import Viewed
 
@@ -40,14 +39,6 @@ class Mask:
 
     change: Change = nothing
     change_prepared: PreparedChange = nothing
-
-
-@dataclass(frozen=True)
-class MaskedEpisode:
-    """An episode that was run under a mask."""
-
-    gripper_xyz: np.ndarray  # (T + 1, 3) metres, before each step and at the end
-    result: Any  # its record
 
 
 def without_object(name: str, fill: str) -> Mask:
@@ -96,13 +87,15 @@ def masks_of(snapshot: Snapshot, loaded: LoadedPolicy, fill: str) -> dict[str, M
     return masks
 
 
-def run_masked(viewed: Viewed, loaded: LoadedPolicy, masks: Mapping[str, Mask]) -> dict[str, MaskedEpisode]:
+def run_masked(viewed: Viewed, loaded: LoadedPolicy, masks: Mapping[str, Mask]) -> dict[str, EpisodeRun]:
     """Run the same episode under each mask, from the same random state of the policy."""
-    return {name: _run(viewed, loaded, mask) for name, mask in masks.items()}
+    return {name: run_under(viewed, loaded, mask) for name, mask in masks.items()}
 
 
-def _run(viewed: Viewed, loaded: LoadedPolicy, mask: Mask) -> MaskedEpisode:
+def run_under(viewed: Viewed, loaded: LoadedPolicy, mask: Mask) -> EpisodeRun:
+    """Run an episode under a mask."""
     loaded.begin()
+    film = Film()
     with closing(viewed.make_env()) as env:
 
         def act(observation: dict[str, Any], instruction: str) -> np.ndarray:
@@ -111,6 +104,6 @@ def _run(viewed: Viewed, loaded: LoadedPolicy, mask: Mask) -> MaskedEpisode:
                 prepared = mask.change_prepared(loaded.prepare(batch), instruction)
             return loaded.act(prepared)[0]
 
-        trace = [moment.observation[AGENT_POS][:3] for moment in run_episode(env, viewed.spec, act)]
-        result: Record = env.get_wrapper_attr("episode_result")()
-    return MaskedEpisode(np.stack(trace), result)
+        for moment in run_episode(env, viewed.spec, act):
+            film.add(moment, env)
+        return film.end(env)

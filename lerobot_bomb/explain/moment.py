@@ -3,7 +3,7 @@
 Shapes: `G` cells along a side of the grid over an image, `L` layers.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +13,8 @@ from torch import Tensor
 
 from lerobot_bomb.explain.activations import all_heads, all_layers, all_mlps
 from lerobot_bomb.explain.images import filling, occluded, patch_masks
+from lerobot_bomb.explain.limits import ALL
+from lerobot_bomb.explain.next_actions import NextActions
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.restoration import Corruption
 from lerobot_bomb.explain.scored_policy import INSTRUCTION, Batch, Rows, TokenSpan
@@ -20,7 +22,6 @@ from lerobot_bomb.explain.spans import Range, Span
 
 PATCH, WORDS, OTHER_INSTRUCTION = "patch", "words", "other instruction"
 OTHER_SCENE = "scene of another episode"  # its images and state, under this one's instruction
-ALL = "all cameras"
 OBSERVATION = "observation"
 
 
@@ -51,6 +52,16 @@ class PatchingResult:
 
 
 @dataclass(frozen=True)
+class Moved:
+    """Distances in millimetres by which the next executed actions change, in place of drops of the score."""
+
+    patches: dict[str, Tensor]
+    objects: dict[str, dict[str, float]]
+    words: dict[str, float]
+    others: dict[str, float]
+
+
+@dataclass(frozen=True)
 class Explanation:
     """Effects on the score of the clean answer: how far it drops."""
 
@@ -61,31 +72,49 @@ class Explanation:
     words: dict[str, float]  # of each span that no other token reads
     others: dict[str, float]  # of each other instruction
     restored: list[PatchingResult]
+    moved_mm: Moved | None = None  # None: this environment's actions are no distances
+
+    @property
+    def measured(self) -> "Moved | Explanation":
+        """Effects as they are shown: in millimetres where these are known, else drops of the score."""
+        return self.moved_mm or self
+
+    @property
+    def measured_unit(self) -> str:
+        """Unit of `measured`."""
+        return self.unit if self.moved_mm is None else "mm"
 
     @property
     def largest_patch(self) -> float:
-        """Largest effect of a patch of any image: maps of one moment have one scale."""
-        return max(float(map_GG.max()) for map_GG in self.patches.values())
+        """Largest shown effect of a patch of any image: maps of one moment have one scale."""
+        return max(float(map_GG.max()) for map_GG in self.measured.patches.values())
 
     def as_json(self) -> dict[str, Any]:
         """Return the explanation as JSON values; NaN becomes None."""
+        moved = self.moved_mm
         values = vars(self) | {
-            "patches": {key: each.tolist() for key, each in self.patches.items()},
+            "patches": _lists(self.patches),
             "restored": [vars(each) for each in self.restored],
+            "moved_mm": None if moved is None else vars(moved) | {"patches": _lists(moved.patches)},
         }
-        return _finite(values)
+        return finite(values)
 
 
-def _finite(value: Any) -> Any:
+def _lists(maps: Mapping[str, Tensor]) -> dict[str, Any]:
+    return {key: map_GG.tolist() for key, map_GG in maps.items()}
+
+
+def finite(value: Any) -> Any:
+    """Return JSON values with None in place of NaN."""
     if isinstance(value, dict):
-        return {key: _finite(each) for key, each in value.items()}
+        return {key: finite(each) for key, each in value.items()}
     if isinstance(value, list):
-        return [_finite(each) for each in value]
+        return [finite(each) for each in value]
     return None if isinstance(value, float) and value != value else value
 
 
-def explain(question: Question, query: MomentQuery) -> Explanation:
-    """Measure all effects of a query.
+def explain(question: Question, query: MomentQuery, actions: NextActions | None = None) -> Explanation:
+    """Measure all effects of a query; with ``actions`` also in millimetres.
 
     Raises:
         ValueError: the grid does not divide an image, or as `filling`.
@@ -103,6 +132,28 @@ def explain(question: Question, query: MomentQuery) -> Explanation:
         words=words,
         others=others,
         restored=[_restore(question, query, name, rows) for name, rows in corruptions],
+        moved_mm=None if actions is None else _moved(question, query, fillings, actions),
+    )
+
+
+def _moved(
+    question: Question, query: MomentQuery, fillings: Mapping[str, Tensor], actions: NextActions
+) -> Moved:
+    """Measure the effects of the same changes on the next actions."""
+    objects: dict[str, dict[str, float]] = {}
+    for key, name, changed in _without_objects(question, query, fillings):
+        objects.setdefault(key, {})[name] = actions.moved_mm(changed)
+    patches = {}
+    for key, filled in fillings.items():
+        masks = patch_masks(query.grid, *filled.shape[1:]).to(filled.device)
+        (image,) = question.observation[key]
+        moved = [actions.moved_mm({key: each[None]}) for each in occluded(image, masks, filled)]
+        patches[key] = torch.tensor(moved).unflatten(0, (query.grid, query.grid))
+    return Moved(
+        patches,
+        objects,
+        {span.name: actions.moved_mm({}, span.tokens(query.offsets)) for span in query.spans},
+        {name: actions.moved_mm({"task": [other]}) for name, other in query.others.items()},
     )
 
 
@@ -132,22 +183,27 @@ def _patches(question: Question, grid: int, key: str, filling_3HW: Tensor) -> Te
     return question.effects_of_masks(key, masks, filling_3HW).unflatten(0, (grid, grid)).cpu()
 
 
+def _without_objects(
+    question: Question, query: MomentQuery, fillings: Mapping[str, Tensor]
+) -> Iterator[tuple[str, str, Batch]]:
+    """Yield (key or ALL, object, images) without each object that cameras show: in one camera, in all."""
+    for name in dict.fromkeys(name for masks in query.objects.values() for name in masks):
+        changed: Batch = {}
+        for key, masks in query.objects.items():
+            if masks[name].any():
+                (image,) = question.observation[key]
+                changed[key] = occluded(image, masks[name][None].to(image.device), fillings[key])
+                yield key, name, {key: changed[key]}
+        if changed:
+            yield ALL, name, changed
+
+
 def _objects(
     question: Question, query: MomentQuery, fillings: Mapping[str, Tensor]
 ) -> dict[str, dict[str, float]]:
-    """Measure each object's effect in each camera and in all at once, for objects that a camera shows."""
     effects: dict[str, dict[str, float]] = {}
-    names = list(dict.fromkeys(name for masks in query.objects.values() for name in masks))
-    for name in names:
-        changed: dict[str, Tensor] = {}
-        for key, masks in query.objects.items():
-            if not masks[name].any():
-                continue
-            (image,) = question.observation[key]
-            changed[key] = occluded(image, masks[name][None].to(image.device), fillings[key])
-            effects.setdefault(key, {})[name] = float(question.effects_of_images({key: changed[key]}))
-        if changed:
-            effects.setdefault(ALL, {})[name] = float(question.effects_of_images(changed))
+    for key, name, changed in _without_objects(question, query, fillings):
+        effects.setdefault(key, {})[name] = float(question.effects_of_images(changed))
     return effects
 
 

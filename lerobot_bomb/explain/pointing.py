@@ -17,7 +17,6 @@ from lerobot_bomb.explain.diagnosis import Finding
 from lerobot_bomb.explain.scored_policy import Batch, ScoredPolicy
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 
-CAMERA = "workspace"  # the one that sees the board as a whole
 SLACK_MM = 5.0  # of an action: twice the noise that demonstrations are recorded with
 SLACK_SHARE = 0.5  # of the way that the expert's action would go
 MARKED_PX = 448  # side of a picture with marks

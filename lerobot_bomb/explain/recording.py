@@ -7,9 +7,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from lerobot_bomb.explain.episode import ExplainedMoment
-from lerobot_bomb.explain.maps import overlay
+from lerobot_bomb.explain.film import CAMERA
+from lerobot_bomb.explain.maps import tinted
 from lerobot_bomb.explain.moment import camera_name
-from lerobot_bomb.explain.pointing import CAMERA
 from lerobot_bomb.viewing.rerun_file import STEP, open_recording, png
 
 
@@ -24,7 +24,7 @@ def write_recording(path: Path, name: str, fps: int, moments: Sequence[Explained
             for key, image in each.images.items():
                 recording.log(f"image/{key}", png(image), strict=True)
                 _log_marks(recording, key, each)
-                effects = overlay(found.patches[key].numpy(), found.largest_patch, image)
+                effects = tinted(found.measured.patches[key].numpy(), found.largest_patch, image)
                 recording.log(f"effect/{key}", png(effects), strict=True)
 
 

@@ -14,16 +14,9 @@ import torch
 from torch import Tensor
 
 from lerobot_bomb.explain.activations import HEADS, MLP, PARTS, Activations, Unit, recording, restoring
+from lerobot_bomb.explain.limits import smallest_drop
 from lerobot_bomb.explain.question import BATCH_SIZE, Question
 from lerobot_bomb.explain.scored_policy import Rows
-
-# a drop of the score that is no larger than this share of it, or this in its unit, may be rounding
-SMALLEST_DROP = 1e-4
-
-
-def smallest_drop(clean_score: float) -> float:
-    """Return the smallest drop of the score that is more than rounding."""
-    return SMALLEST_DROP * max(1.0, abs(clean_score))
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium
@@ -10,17 +10,14 @@ import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, Intersection
 from lerobot_bomb.bomb.camera import PinholeCamera
-from lerobot_bomb.bomb.episode import Stage
 from lerobot_bomb.bomb.expert import current_goal
 from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.envs.rollout import Moment, run_episode
+from lerobot_bomb.explain.film import EpisodeRun, Film
+from lerobot_bomb.explain.phases import PHASES, gripper_does, phases_of
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 from lerobot_bomb.viewing.episode import Viewed
-
-REACH, GRASP, CARRY, PLACE = "reach", "grasp", "carry", "place"
-PHASES = (REACH, GRASP, CARRY, PLACE)
-NEAR_M = BOARD.pitch_m  # of the stone from where it is to go: it is being placed
 
 
 @dataclass(frozen=True)
@@ -38,6 +35,7 @@ class Snapshot:
     target: Intersection | None
     state: PrivilegedState | None  # of BOMB
     cameras: Mapping[str, PinholeCamera]  # {}: not known
+    does: str = ""  # what the gripper does, in words
 
     @property
     def stone_xyz(self) -> np.ndarray | None:
@@ -50,20 +48,28 @@ class Snapshot:
         return {word: instruction for word, (instruction, _) in self.others.items()}
 
 
-def take_snapshots(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Snapshot], Any]:
-    """Return every moment in which the policy acts, and the result of the episode."""
+def take_snapshots(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Snapshot], EpisodeRun]:
+    """Return every moment in which the policy acts, and the episode as it ran."""
     loaded.begin()
     with closing(viewed.make_env()) as env:
 
         def act(observation: dict[str, Any], instruction: str) -> np.ndarray:
             return loaded.agent([observation], [instruction])[0]
 
-        moments = [
-            _snapshot(moment, env)
-            for moment in run_episode(env, viewed.spec, act)
-            if moment.action is not None
-        ]
-        return moments, env.get_wrapper_attr("episode_result")()
+        film, taken = Film(), []
+        for moment in run_episode(env, viewed.spec, act):
+            film.add(moment, env)
+            if moment.action is not None:
+                taken.append(_snapshot(moment, env))
+        run = film.end(env)
+    if taken[0].state is None:
+        return taken, run
+    states = [each.state for each in taken if each.state is not None]
+    named = [
+        replace(each, phase=phase, does=gripper_does(phase, stone, state))
+        for each, state, (phase, stone) in zip(taken, states, phases_of(states), strict=True)
+    ]
+    return named, run
 
 
 def _snapshot(moment: Moment, env: gymnasium.Env) -> Snapshot:
@@ -73,7 +79,7 @@ def _snapshot(moment: Moment, env: gymnasium.Env) -> Snapshot:
     goal = None if state is None else current_goal(state)
     return Snapshot(
         step=moment.step,
-        phase=_phase(moment) if is_bomb else "",
+        phase="",
         observation=moment.observation,
         instruction=moment.instruction,
         objects=env.get_wrapper_attr("object_masks")() if is_bomb else {},
@@ -82,18 +88,6 @@ def _snapshot(moment: Moment, env: gymnasium.Env) -> Snapshot:
         state=state,
         cameras=env.get_wrapper_attr("cameras")() if is_bomb else {},
     )
-
-
-def _phase(moment: Moment) -> str:
-    """Return the phase of a moment of BOMB."""
-    stage, state = Stage(moment.info["stage"]), moment.state
-    if stage is Stage.START:
-        return REACH
-    if stage in (Stage.REACHED, Stage.GRASPED):
-        return GRASP
-    goal = current_goal(state)
-    distance_m = np.linalg.norm(state.stone_xyz[goal.stone][:2] - goal.xyz[:2])
-    return PLACE if distance_m <= NEAR_M else CARRY
 
 
 def middle_of_phases(moments: list[Snapshot]) -> list[Snapshot]:

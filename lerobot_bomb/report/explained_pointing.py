@@ -8,9 +8,10 @@ import numpy as np
 from lerobot_bomb.bomb.move import place_name
 from lerobot_bomb.explain.aggregate import mean_of
 from lerobot_bomb.explain.episode import ExplainedMoment
+from lerobot_bomb.explain.film import CAMERA
 from lerobot_bomb.explain.maps import data_url
 from lerobot_bomb.explain.moment import camera_name
-from lerobot_bomb.explain.pointing import CAMERA, MARKED_PX, PointingCheck, marked
+from lerobot_bomb.explain.pointing import MARKED_PX, PointingCheck, marked
 from lerobot_bomb.report.cells import mean_cell
 from lerobot_bomb.report.table import Cell, Table
 

@@ -1,0 +1,123 @@
+"""Sentences about how episodes ended: as recorded, without a perturbation, with something hidden.
+
+They read the values of `explanation.json`.
+"""
+
+from collections.abc import Mapping, Sequence
+
+from lerobot_bomb.bomb.episode import Failure
+from lerobot_bomb.bomb.judge import COLLATERAL_TOLERANCE_MM
+from lerobot_bomb.conditions import NONE
+from lerobot_bomb.explain.effects import Values
+from lerobot_bomb.stats import format_rate
+
+# what happened, by failure class of BOMB
+HAPPENED = {
+    Failure.NEVER_REACHED: "the gripper never came to the stone",
+    Failure.MISSED_GRASP: "it came to the stone, but never lifted it",
+    Failure.DROPPED: "it lifted the stone and let it fall",
+    Failure.WRONG_STONE: "it took another stone than the one that is meant",
+    Failure.WRONG_INTERSECTION: "it put the stone down in the wrong place",
+    Failure.IMPRECISE: "it put the stone down at the right intersection, but not precisely",
+    Failure.DISTURBED_OTHERS: "its stone is in place, but it moved another one",
+    Failure.TIMEOUT_HOLDING: "it had not let go of the stone when time ran out",
+    Failure.LIFTED: "it lifted a stone that is to be slid",
+}
+
+
+def outcome(result: Values) -> str:
+    """Return how an episode ended: class, what it means, where the stone lies, what else was moved."""
+    ending = _ending(result)
+    facts = [HAPPENED.get(result["failure"], ""), *_distances(result)]
+    told = "; ".join(each for each in facts if each)
+    return f"{ending}: {told}." if told else f"{ending}."
+
+
+def _ending(result: Values) -> str:
+    name = "It succeeded" if result["is_success"] else f"It failed ({result['failure']})"
+    return f"{name} after {result['steps']} steps" if "steps" in result else name
+
+
+def _distances(result: Values) -> list[str]:
+    """Return where the stone is and how far another one was moved, of BOMB."""
+    if "placement_error_mm" not in result:
+        return []
+    error_mm, moved_mm = result["placement_error_mm"], result["collateral_mm"]
+    target = "its target" if result["target"] is None else _intersection(result["target"])
+    nearest = _intersection(result["nearest_intersection"])
+    beside = "" if result["is_success"] or nearest == target else f", nearest to {nearest}"
+    found = [f"the stone is {error_mm:.1f} mm from {target}{beside}"]
+    if moved_mm > COLLATERAL_TOLERANCE_MM:
+        allowed = f"{COLLATERAL_TOLERANCE_MM:.0f} mm are allowed"
+        found.append(f"another stone was moved {moved_mm:.1f} mm ({allowed})")
+    return found
+
+
+def _intersection(place: Sequence[int]) -> str:
+    row, column = place
+    return f"row {row}, column {column}"
+
+
+def outcomes(results: Sequence[Values]) -> str:
+    """Return how often episodes succeeded, and the classes of the others."""
+    failures = [each["failure"] for each in results if not each["is_success"]]
+    counts = {name: failures.count(name) for name in sorted(set(failures), key=failures.count, reverse=True)}
+    classes = ", ".join(f"{name} {number}" for name, number in counts.items())
+    rate = format_rate(len(results) - len(failures), len(results))
+    return f"Success: {rate}{f'; failures: {classes}' if classes else ''}."
+
+
+def as_recorded(result: Values, recorded: Values | None) -> list[str]:
+    """Return a sentence if the episode ended otherwise than its record says."""
+    if recorded is None or recorded["failure"] == result["failure"]:
+        return []
+    then = recorded["failure"] or "success"
+    return [f"In its record it ended otherwise ({then}): what follows is about the run shown here."]
+
+
+def without_perturbations(counterfactuals: Sequence[Values]) -> list[str]:
+    """Return what the same seed without some of its perturbations says."""
+    if not counterfactuals:
+        return []
+    clean = next(each for each in counterfactuals if each["perturbations"] == NONE)
+    single = [each for each in counterfactuals if len(each["without"]) == 1]
+    helped = [each for each in single if each["result"]["is_success"]]
+    if helped:
+        ways = " or ".join(f"{each['without'][0]}{_steps(each['result'])}" for each in helped)
+        rest = len(single) - len(helped)
+        others = f"; without any one of the other {rest} it fails too" if rest else ""
+        return [f"The same seed succeeds without the perturbation {ways}{others}."]
+    if clean["result"]["is_success"]:
+        told = f"The same seed succeeds unperturbed{_steps(clean['result'])}"
+        return [f"{told}, but without any single perturbation it fails too: they break it together."]
+    failure = clean["result"]["failure"]
+    return [f"The perturbations are not the reason: the same seed unperturbed fails too ({failure})."]
+
+
+def _steps(result: Values) -> str:
+    return f" (after {result['steps']} steps)" if "steps" in result else ""
+
+
+def with_masks(masked: Mapping[str, Values]) -> list[str]:
+    """Return which hidden inputs turn the episode's outcome over, where they are hidden in every step."""
+    clean = masked.get("nothing")
+    if clean is None:
+        return []
+    turned = [name for name, each in masked.items() if each["is_success"] != clean["is_success"]]
+    if not turned:
+        still = "succeeds" if clean["is_success"] else "fails"
+        return [f"Whatever single input is hidden in every step, it still {still}."]
+    ended = "fails" if clean["is_success"] else "succeeds"
+    return [f"It {ended} if any one of these is hidden in every step: {', '.join(map(_mask, turned))}."]
+
+
+def _mask(name: str) -> str:
+    kind, _, rest = name.partition(": ")
+    return {"object": f"the {rest}", "words": word_name(rest)}.get(kind, name)
+
+
+def word_name(name: str) -> str:
+    """Return "the word for row", "the words for row and column", 'the word "black"'."""
+    if name.startswith('"'):
+        return f"the word {name}"
+    return f"the word{'s' if ' and ' in name else ''} for {name.replace('color', 'colour')}"

@@ -1,0 +1,255 @@
+"""Verdict of an explanation: sentences from the values of `explanation.json`."""
+
+from typing import Any
+
+import pytest
+
+from lerobot_bomb.explain.facts import outcome
+from lerobot_bomb.explain.verdict import reasons, verdict
+
+GRID = [[0.0, 0.0], [0.0, 0.0]]
+
+
+def moment(phase: str = "reach", **values: Any) -> dict[str, Any]:
+    """Effects of a moment; ``mm``: in millimetres."""
+    effects = {"patches": {"observation.images.wrist": GRID}, "objects": {}, "words": {}, "others": {}}
+    mm = values.pop("mm", None)
+    given = {"phase": phase, "unit": "nats", "clean_score": -2.0, "restored": [], "following": {}}
+    return effects | given | {"moved_mm": None if mm is None else effects | mm} | values
+
+
+def seen(**objects: float) -> dict[str, Any]:
+    return {"objects": {"all cameras": objects}}
+
+
+def result(failure: str | None = None, **values: Any) -> dict[str, Any]:
+    return {
+        "is_success": failure is None,
+        "failure": failure,
+        "steps": 24,
+        "placement_error_mm": 43.04,
+        "target": [4, 2],
+        "nearest_intersection": [3, 2],
+        "collateral_mm": 0.1,
+    } | values
+
+
+# Objects, patches, words
+
+
+def test_one_that_never_looked_at_the_stone() -> None:
+    words = {"row": 12.0, "column": 9.0, "row and column": 18.5, "color": 0.2, '"Place"': 3.0}
+    moments = [
+        moment("reach", mm=seen(stone=0.3, board=14.0, gripper=0.1)),
+        moment("carry", mm=seen(stone=0.2, board=2.0, gripper=6.0) | {"words": words}),
+    ]
+    assert reasons(moments) == [
+        "In the 2 steps examined, it never looked at the stone: hiding it changes the next action by at most "
+        "0.3 mm, hiding the board by 14.0 mm at reach.",
+        "It looks at the board (14.0 mm at reach) and the gripper (6.0 mm at carry): so much the next action "
+        "moves when that is hidden.",
+        "Of the instruction, only the words for row and column (18.5 mm at carry) decide; no other word does "
+        "(at most 0.2 mm).",
+    ]
+
+
+def test_one_that_looks_at_nothing_and_reads_nothing() -> None:
+    values = seen(stone=0.1, board=0.3) | {"words": {"row": 0.0}, "others": {"row": 0.04}}
+    assert reasons([moment(mm=values)]) == [
+        "It looks at nothing in its images: hiding any one thing changes the next action by at most 0.3 mm.",
+        "It does not read the instruction: hiding or changing any of its words changes the next action by at "
+        "most 0.0 mm.",
+    ]
+    assert reasons([moment()])[-1] == "It reads no instruction."
+
+
+def test_a_changed_word_counts_as_much_as_a_hidden_one() -> None:
+    words = {"row": 0.4, "column": 5.0, "row and column": 5.6}
+    (_, told) = reasons([moment("carry", mm={"words": words, "others": {"row": 25.0, "column": 9.0}})])
+    assert told == "Of the instruction, only the words for row and column (25.0 mm at carry) decide."
+    (_, told) = reasons([moment("carry", mm={"words": words | {"row": 0.0, "color": 0.3}})])
+    assert told == (
+        "Of the instruction, only the word for column (5.0 mm at carry) decides; no other word does "
+        "(at most 0.3 mm)."
+    )
+
+
+def test_without_millimetres_it_speaks_of_the_score() -> None:
+    patches = {"observation.images.wrist": [[0.0, 3.5], [1e-5, 0.1]]}
+    assert reasons([moment("grasp", patches=patches, words={"column": -0.02, "row": 1e-6})]) == [
+        "Of all image patches, only wrist patch 0, 1 matters (3.5 nats at grasp).",
+        "Of the instruction, only the word for column (0.02 nats at grasp) decides; no other word does "
+        "(at most 1e-06 nats) - weakly, beside what it sees.",
+    ]
+    assert reasons([moment("grasp", patches={"wrist": [[2.0, 3.5], [1e-5, 0.1]]})])[0] == (
+        "2 of 4 image patches matter, most of all wrist patch 0, 1 (3.5 nats at grasp)."
+    )
+
+
+def test_words_of_a_suite_without_rows_are_named() -> None:
+    words = {'"between"': 5.3, '"white"': 4.0, '"the"': 0.02}
+    assert reasons([moment("carry", words=words)])[-1] == (
+        'Of the instruction, the word "between" (5.3 nats at carry) and the word "white" (4 nats at carry) '
+        "decide; no other word does (at most 0.02 nats)."
+    )
+
+
+def test_how_far_it_follows_another_target_is_told() -> None:
+    following = {"row": {"along_mm": 31.68}, "column": {"along_mm": 0.4}, "color": {"along_mm": None}}
+    assert reasons([moment("carry", following=following)])[-1] == (
+        "Told to go elsewhere, the next action turns there: 31.7 mm at carry for another row."
+    )
+
+
+@pytest.mark.parametrize(
+    ("heads", "told"),
+    [
+        (
+            [[0.0, 0.1], [0.98, None]],
+            "One head alone carries the instruction at carry: layer 1, head 0 (98%) of ",
+        ),
+        (
+            [[0.6, 0.1], [0.98, 0.0]],
+            "2 heads each carry the instruction at carry: layer 1, head 0 (98%) and ",
+        ),
+    ],
+)
+def test_heads_that_carry_the_instruction_are_named(heads: list[list[float | None]], told: str) -> None:
+    restored = [
+        {"corruption": "wrist patch 1, 2 taken out", "drop": 9.0, "heads": [[1.0, 1.0], [1.0, 1.0]]},
+        {"corruption": "other instruction: 'Place it.'", "drop": 0.4, "heads": heads},
+    ]
+    assert reasons([moment("carry", restored=restored)])[-1].startswith(told)
+    weak = [restored[1] | {"drop": 1e-5}]
+    assert reasons([moment("carry", restored=weak)])[-1] == "It reads no instruction."
+
+
+def test_pointing_tells_misreading_from_not_acting() -> None:
+    right = {"place": "row 1, column 3", "meant_place": "row 1, column 3", "goes_there": True}
+    moments = [moment("reach", pointing=right), moment("carry", pointing=right | {"goes_there": False})]
+    assert reasons(moments)[-1] == (
+        "It points at the place that is meant, but its next action does not go there, in 1 of 2 moments "
+        "(at carry)."
+    )
+    assert reasons(moments[:1])[-1] == (
+        "It points at the place that is meant, and its next action goes there."
+    )
+    wrong = moment("carry", pointing=right | {"place": "row 2, column 3"})
+    assert reasons([moments[0], wrong])[-1] == (
+        "It misreads the place in 1 of 2 moments: it points at row 2, column 3, not row 1, column 3 "
+        "(at carry)."
+    )
+
+
+# Endings
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        (
+            result(placement_error_mm=0.11),
+            "It succeeded after 24 steps: the stone is 0.1 mm from row 4, column 2.",
+        ),
+        (
+            result("missed_grasp", collateral_mm=55.6),
+            "It failed (missed_grasp) after 24 steps: it came to the stone, but never lifted it; the stone "
+            "is 43.0 mm from row 4, column 2, nearest to row 3, column 2; another stone was moved 55.6 mm "
+            "(10 mm are allowed).",
+        ),
+        (
+            result("dropped", target=None),
+            "It failed (dropped) after 24 steps: it lifted the stone and let it fall; the stone is 43.0 mm "
+            "from its target, nearest to row 3, column 2.",
+        ),
+        ({"is_success": False, "failure": "timeout"}, "It failed (timeout)."),
+    ],
+)
+def test_an_outcome_says_what_the_record_knows(values: dict[str, Any], told: str) -> None:
+    assert outcome(values) == told
+
+
+def without(axes: list[str], left: str, failure: str | None) -> dict[str, Any]:
+    return {"without": axes, "perturbations": left, "result": result(failure, steps=23)}
+
+
+BOTH_FAIL = [without(["camera"], "object:3", "dropped"), without(["object"], "camera:3", "dropped")]
+
+
+@pytest.mark.parametrize(
+    ("counterfactuals", "told"),
+    [
+        (
+            [without(["object"], "none", None)],
+            "The same seed succeeds without the perturbation object (after 23 steps).",
+        ),
+        (
+            [without(["object"], "none", "dropped")],
+            "The perturbations are not the reason: the same seed unperturbed fails too (dropped).",
+        ),
+        (
+            [
+                BOTH_FAIL[0],
+                without(["object"], "camera:3", None),
+                without(["camera", "object"], "none", None),
+            ],
+            "The same seed succeeds without the perturbation object (after 23 steps); without any one of the "
+            "other 1 it fails too.",
+        ),
+        (
+            [*BOTH_FAIL, without(["camera", "object"], "none", None)],
+            "The same seed succeeds unperturbed (after 23 steps), but without any single perturbation it "
+            "fails too: they break it together.",
+        ),
+    ],
+)
+def test_a_counterfactual_settles_it(counterfactuals: list[dict[str, Any]], told: str) -> None:
+    episode = {"result": result("imprecise"), "moments": [moment()], "counterfactuals": counterfactuals}
+    assert verdict([episode])[1] == told
+
+
+def test_masks_that_turn_the_outcome_are_named() -> None:
+    masked = {"nothing": result(), "object: stone": result("dropped"), "object: board": result()}
+    masked |= {"words: row": result("imprecise"), "the whole instruction": result("imprecise")}
+    episode = {"result": result(), "moments": [moment()], "masked_episodes": masked}
+    assert verdict([episode])[1] == (
+        "It fails if any one of these is hidden in every step: the stone, the word for row, the whole "
+        "instruction."
+    )
+    masked = {"nothing": result("dropped"), "object: stone": result("dropped")}
+    episode = {"result": result("dropped"), "moments": [moment()], "masked_episodes": masked}
+    assert verdict([episode])[1] == "Whatever single input is hidden in every step, it still fails."
+
+
+def test_a_run_that_ended_otherwise_than_its_record_says_so() -> None:
+    episode = {"result": result("imprecise"), "recorded": result(), "moments": [moment()]}
+    assert verdict([episode])[1].startswith("In its record it ended otherwise (success)")
+    assert not verdict([episode | {"recorded": result("imprecise")}])[1].startswith("In its record")
+
+
+# Several episodes
+
+
+def test_several_episodes_give_means_with_intervals_over_them() -> None:
+    episodes = [
+        {
+            "result": result(None if number else "dropped"),
+            "moments": [moment("grasp", mm=seen(stone=mm, board=0.1))],
+        }
+        for number, mm in enumerate([10.0, 12.0, 14.0, 16.0])
+    ]
+    first, looks, never, _ = verdict(episodes)
+    assert first == "Success: 3/4 = 75.0 % [30.1, 95.4]; failures: dropped 1."
+    assert looks.startswith("It looks at the stone (13.0 mm [1") and "at grasp" in looks
+    assert never.startswith(
+        "In the 4 steps examined, it never looked at the board: hiding it changes the next action"
+    )
+
+
+def test_an_effect_whose_interval_has_zero_in_it_is_left_open() -> None:
+    episodes = [
+        {"result": result(), "moments": [moment("grasp", **seen(stone=nats, board=1.0))]}
+        for nats in (-0.9, 1.0, -0.7, 1.2)
+    ]
+    assert verdict(episodes)[1].startswith("It looks at the board (")
+    assert verdict(episodes)[2].startswith("No effect is shown, nor excluded, of the stone (0.15 nats [-")
