@@ -373,7 +373,7 @@ def test_videos_that_cannot_be_had_are_told_and_are_no_error(
     rows = columns(table)
     assert [row["video"][:9] for row in rows] == ["no video:", "", "", "no video:", ""]
     assert "outputs/act" in rows[0]["video"]  # where no checkpoint lies
-    assert "videos that are missing: 2, as lerobot-bomb replay " in capsys.readouterr().err
+    assert "failures that could not be shown: 2, as lerobot-bomb replay " in capsys.readouterr().err
     assert Videos(tmp_path / "out" / "r.html").sources == []
 
 
