@@ -11,10 +11,10 @@ from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.envs.rollout import Agent, expert_agent, make_env, run_episode
-from lerobot_bomb.viewing.bomb import bomb_episode
+from lerobot_bomb.viewing.bomb import BombView, bomb_episode
 from lerobot_bomb.viewing.bomb_film import bomb_contact, bomb_shot
 from lerobot_bomb.viewing.episode import ViewedRun, write_episode_with_film, write_episodes
-from lerobot_bomb.viewing.film import RING_RGB, TILE_SIZE, Marks, drawn, film_of
+from lerobot_bomb.viewing.film import RING_RGB, TILE_SIZE, Film, Marks, drawn, film_of
 from lerobot_bomb.viewing.sheet import BAR_HEIGHT, title_bar
 
 SPEC = EpisodeSpec(seed=4, target=(3, 2), color="white", fps=5, perturbations="camera:3")
@@ -63,31 +63,17 @@ def test_the_ring_is_where_the_target_is_and_lines_are_numbered() -> None:
     env.close()
 
 
-def test_the_moment_in_the_middle_is_the_first_grasp(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("agent", "name"), [(expert_agent(), "grasp"), (still, "middle")])
+def test_the_moment_in_the_middle_is_the_first_grasp_if_there_is_one(agent: Agent, name: str) -> None:
     env = make_env(SPEC, OPTIONS)
-    contacts = [bomb_contact(moment) for moment in run_episode(env, SPEC, expert_agent())]
+    film, contacts = Film(BombView(), env), []
+    for moment in run_episode(env, SPEC, agent):
+        film.add(moment)
+        contacts.append(bomb_contact(moment))
     env.close()
-    columns: list[list[str]] = []
-    monkeypatch.setattr("lerobot_bomb.viewing.film.Sheet", recorder(columns))
-    with pytest.raises(StopIteration):
-        film_of(viewed_run(expert_agent()))
     last = len(contacts) - 1
-    assert columns == [["start", f"grasp, step {contacts.index('grasp')}", f"end, step {last}"]]
-    with pytest.raises(StopIteration):
-        film_of(viewed_run(still))
-    steps = int(columns[1][2].split()[-1])
-    assert columns[1] == ["start", f"middle, step {steps // 2}", f"end, step {steps}"]
-
-
-def recorder(columns: list[list[str]]) -> Any:
-    """Return a stand-in for `Sheet` that notes its columns, and draws nothing."""
-
-    def note(heading: str, names: list[str], **_: Any) -> Any:
-        assert heading.startswith("place, camera:3, seed 4: ")
-        columns.append(names)
-        raise StopIteration
-
-    return note
+    step = contacts.index("grasp") if name == "grasp" else last // 2
+    assert film.moments == {"start": 0, f"{name}, step {step}": step, f"end, step {last}": last}
 
 
 def test_a_video_and_its_film_come_from_one_run(tmp_path: Any) -> None:

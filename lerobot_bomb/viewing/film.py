@@ -55,18 +55,22 @@ class Film:
         if contact and (self._contact is None or contact != self._contact[1]):
             self._contact = moment.step, contact
 
-    def draw(self, heading: str, instruction: str, outcome: str) -> np.ndarray:
-        """Draw the filmstrip, (H, W, 3) uint8."""
+    @property
+    def moments(self) -> dict[str, int]:
+        """Steps that are shown, by the name of their column."""
         last = len(self._shots) - 1
         step, name = self._contact or (last // 2, "middle")
-        moments = {"start": 0, f"{name}, step {step}": step, f"end, step {last}": last}
+        return {"start": 0, f"{name}, step {step}": step, f"end, step {last}": last}
+
+    def draw(self, heading: str, instruction: str, outcome: str) -> np.ndarray:
+        """Draw the filmstrip, (H, W, 3) uint8."""
         rows: dict[str, list[np.ndarray]] = {}
-        for step in moments.values():
+        for step in self.moments.values():
             shot = self._shots[step]
             for row, image in shot.images.items():
                 tile = drawn(unpacked(image), shot.marks.get(row, Marks()))
                 rows.setdefault(row, []).append(tile)
-        sheet = Sheet(heading, list(moments), images=rows, label_width=LABEL_WIDTH).draw()
+        sheet = Sheet(heading, list(self.moments), images=rows, label_width=LABEL_WIDTH).draw()
         return np.vstack([sheet, caption(instruction, outcome, sheet.shape[1])])
 
 
@@ -97,9 +101,9 @@ def drawn(image: np.ndarray, marks: Marks) -> np.ndarray:
         return xy[0] * TILE_SIZE / width, xy[1] * TILE_SIZE / height
 
     for outline in marks.outlines:
-        points = [at(xy) for xy in (*outline, outline[0])]
-        pen.line(points, EDGE_RGB, RING_WIDTH + 2, joint="curve")
-        pen.line(points, RING_RGB, RING_WIDTH, joint="curve")
+        points = [at(xy) for xy in outline]
+        pen.polygon(points, outline=EDGE_RGB, width=RING_WIDTH + 2)
+        pen.polygon(points, outline=RING_RGB, width=RING_WIDTH)
     for word, xy in marks.words.items():
         pen.text(at(xy), word, MARK_RGB, font(MARK_SIZE), anchor="mm", stroke_width=2, stroke_fill=EDGE_RGB)
     return np.asarray(tile)
