@@ -410,21 +410,21 @@ def test_failures_are_shown_as_videos_beside_the_page(
     assert {path.suffix for path in (page.parent / "r_videos").iterdir()} == {".mp4"}
     text = page.read_text()
     assert "not as recorded" not in text
-    assert text.count('src="data:image/png;base64,') == len(sources)  # a filmstrip beside each video
+    assert text.count('src="data:image/jpeg;base64,') == len(sources)  # a filmstrip beside each video
     filmed = tmp_path / "filmed.html"
     assert main(["report", str(results), f"--output={filmed}", "--films=1"]) == 0
-    assert filmed.read_text().count('src="data:image/png;base64,') == len(sources)
+    assert filmed.read_text().count('src="data:image/jpeg;base64,') == len(sources)
     assert Videos(filmed).sources == [] and not (tmp_path / "filmed_videos").exists()
 
 
 def test_names_beside_a_filmstrip_are_text_and_short() -> None:
     record = read(values(3, "dropped", instruction="<script>x</script>"))
     name = "<b>&" + "n" * 5000
-    films = samples.section(Report([], [Sample(name, record, Path("a b.jsonl"), 7, film=b"png")])).figures
+    films = samples.section(Report([], [Sample(name, record, Path("a b.jsonl"), 7, film=b"jpeg")])).figures
     assert "<script>" not in films and "<b>" not in films
     assert "&lt;script&gt;x&lt;/script&gt;. dropped, none, seed 3" in films
     assert f"<pre>lerobot-bomb replay {escape(repr('a b.jsonl'))} --line=7" in films
-    assert f'src="data:image/png;base64,{b64encode(b"png").decode()}"' in films
+    assert f'src="data:image/jpeg;base64,{b64encode(b"jpeg").decode()}"' in films
     heading = films.split("<h3")[1].split("</h3>")[0].split(">")[1]
     assert len(heading) < 120
     assert films.count("<h3") == films.count("<figure>") == 1

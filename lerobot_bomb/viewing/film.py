@@ -18,7 +18,7 @@ from lerobot_bomb.viewing.video import packed, unpacked
 TILE_SIZE = 260  # pixels
 LABEL_WIDTH = 80  # pixels
 MARK_RGB, EDGE_RGB = (255, 255, 255), (0, 0, 0)  # white with a black edge is seen on all that is drawn
-RING_RGB = (0, 158, 115)  # Okabe-Ito's green
+RING_RGB = (255, 0, 190)  # pink: neither board nor stones nor gripper have it, also for the colour-blind
 MARK_SIZE, RING_WIDTH = 14, 3  # pixels
 
 
@@ -101,9 +101,9 @@ def drawn(image: np.ndarray, marks: Marks) -> np.ndarray:
         return xy[0] * TILE_SIZE / width, xy[1] * TILE_SIZE / height
 
     for outline in marks.outlines:
-        points = [at(xy) for xy in outline]
-        pen.polygon(points, outline=EDGE_RGB, width=RING_WIDTH + 2)
-        pen.polygon(points, outline=RING_RGB, width=RING_WIDTH)
+        points = [at(xy) for xy in (*outline, *outline[:2])]
+        pen.line(points, EDGE_RGB, RING_WIDTH + 2)
+        pen.line(points, RING_RGB, RING_WIDTH)
     for word, xy in marks.words.items():
         pen.text(at(xy), word, MARK_RGB, font(MARK_SIZE), anchor="mm", stroke_width=2, stroke_fill=EDGE_RGB)
     return np.asarray(tile)

@@ -14,7 +14,7 @@ NOTE = (
 )
 LEGEND = (
     "Each filmstrip is an episode that was run again: its start, its first grasp (or contact, or middle), "
-    "its end. Green rings are the targets; r0 to r4 and c0 to c4 number rows and columns."
+    "its end. Pink rings are the targets; r0 to r4 and c0 to c4 number rows and columns."
 )
 MAX_NAME = 100  # characters of a group's name in a heading
 
@@ -50,7 +50,7 @@ def _film(sample: Sample) -> str:
     words = [getattr(record, "instruction", ""), f"{record.failure}, {spec.perturbations}, seed {spec.seed}"]
     words += [sample.note] if sample.note else []
     told = ". ".join(word.rstrip(".") for word in words if word)
-    source = f"data:image/png;base64,{base64.b64encode(sample.film).decode()}"
+    source = f"data:image/jpeg;base64,{base64.b64encode(sample.film).decode()}"
     commands = "\n".join(filter(None, (sample.command, sample.explanation)))
     return (
         f'<figure><img src="{source}" alt="Filmstrip: {escape(told)}" loading="lazy" '
