@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -66,7 +67,10 @@ def write_dataset(root: Path, dtype: str) -> Path:
         "data/chunk_index": [0] * NUM_EPISODES, "data/file_index": [0] * NUM_EPISODES,
     }  # fmt: skip
     rows = [(episode, frame) for episode in range(NUM_EPISODES) for frame in range(LENGTH)]
-    table = {"episode_index": [row[0] for row in rows], "frame_index": [row[1] for row in rows]}
+    table: dict[str, list[Any]] = {
+        "episode_index": [row[0] for row in rows],
+        "frame_index": [row[1] for row in rows],
+    }
     for camera, name in enumerate((WORKSPACE, WRIST)):
         if dtype == "video":
             write_video(root / "videos" / name / "chunk-000" / "file-000.mp4", camera)

@@ -166,7 +166,7 @@ def write_video(
     dataset: RecordedDataset, episodes: Sequence[int], path: Path, progress: Callable[[int], object]
 ) -> None:
     """Write all frames of the episodes, one after the other, cameras side by side, with their instruction."""
-    shape = None
+    size: tuple[int, int] | None = None  # of all images of a video
     with VideoFile(path, round(dataset.info["fps"])) as video:
         for episode in episodes:
             length, task = dataset.num_frames(episode), dataset.task(episode)
@@ -176,8 +176,8 @@ def write_video(
                 width = max(MIN_WIDTH, shown.shape[1])
                 bar = caption(task, f"episode {episode}, frame {frame} of {length}", width)
                 drawn = np.vstack([_fitted(shown, (VIDEO_HEIGHT, width)), bar])
-                shape = shape or drawn.shape[:2]
-                video.add(_fitted(drawn, shape))
+                size = size or (drawn.shape[0], drawn.shape[1])
+                video.add(_fitted(drawn, size))
             progress(episode)
 
 
