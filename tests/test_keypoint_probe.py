@@ -180,7 +180,7 @@ def test_a_checkpoint_without_one_of_the_tensors_is_refused(tmp_path: Path) -> N
 
 
 def test_a_card_of_what_has_no_backbone_names_none() -> None:
-    card = Checkpoint(make_config(), KeypointProbePolicy.method, "me/x", "me/d").card()
+    card = Checkpoint(make_config(), KeypointProbePolicy.method, "me/x").card()
     assert "Backbone" not in card.text and "Deep spatial autoencoders" in card.text
     data = card.data.to_dict()
     assert data["license"] == "apache-2.0" and "base_model" not in data

@@ -119,5 +119,5 @@ def test_the_model_card_says_it() -> None:
     for name in CASES:
         config = PreTrainedConfig.from_pretrained(FOLDER / name)
         method: Any = getattr(get_policy_class(name), "method")  # noqa: B009  LeRobot's class has none
-        card = Checkpoint(config=config, method=method, repo_id="me/x", dataset_id=None).card()
+        card = Checkpoint(config=config, method=method, repo_id="me/x").card()
         assert f"Methods used in this checkpoint: {of_shipped(name)}." in str(card)

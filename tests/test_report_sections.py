@@ -2,7 +2,9 @@
 
 import json
 import shlex
+from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
+from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 from statistics import median
@@ -10,14 +12,15 @@ from typing import Any
 
 import av
 import pytest
-from result_rows import ACT, FDVLA, values
+from result_rows import ACT, FDVLA, read, values
 
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.checkpoints.names import REPLACE_TASKS
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.commands.report import NUM_SAMPLES
 from lerobot_bomb.environments import ENVIRONMENTS
-from lerobot_bomb.report.sections import SECTIONS
+from lerobot_bomb.report.report import Report, Sample
+from lerobot_bomb.report.sections import SECTIONS, samples
 from lerobot_bomb.report.sections.published import MARK, SPEED, SUCCESS
 from lerobot_bomb.results.origin import PolicyIdentity
 
@@ -451,7 +454,7 @@ def test_videos_that_cannot_be_had_are_told_and_are_no_error(
     rows = columns(table)
     assert [row["video"][:9] for row in rows] == ["no video:", "", "", "no video:", ""]
     assert "outputs/act" in rows[0]["video"]  # where no checkpoint lies
-    assert "videos that are missing: 2, as lerobot-bomb replay " in capsys.readouterr().err
+    assert "failures that could not be shown: 2, as lerobot-bomb replay " in capsys.readouterr().err
     assert Videos(tmp_path / "out" / "r.html").sources == []
 
 
@@ -483,7 +486,32 @@ def test_failures_are_shown_as_videos_beside_the_page(
         with av.open(str(page.parent / row["video"])) as file:
             assert sum(1 for _ in file.decode(video=0)) == steps + 1
     assert {path.suffix for path in (page.parent / "r_videos").iterdir()} == {".mp4"}
-    assert "not as recorded" not in page.read_text()
+    text = page.read_text()
+    assert "not as recorded" not in text
+    assert text.count('src="data:image/jpeg;base64,') == len(sources)  # a filmstrip beside each video
+    filmed = tmp_path / "filmed.html"
+    assert main(["report", str(results), f"--output={filmed}", "--films=1"]) == 0
+    assert filmed.read_text().count('src="data:image/jpeg;base64,') == len(sources)
+    assert Videos(filmed).sources == [] and not (tmp_path / "filmed_videos").exists()
+
+
+def test_names_beside_a_filmstrip_are_text_and_short() -> None:
+    record = read(values(3, "dropped", instruction="<script>x</script>"))
+    name = "<b>&" + "n" * 5000
+    films = samples.section(Report([], [Sample(name, record, Path("a b.jsonl"), 7, film=b"jpeg")])).figures
+    assert "<script>" not in films and "<b>" not in films
+    assert "&lt;script&gt;x&lt;/script&gt;. dropped, none, seed 3" in films
+    assert f"<pre>lerobot-bomb replay {escape(repr('a b.jsonl'))} --line=7" in films
+    assert f'src="data:image/jpeg;base64,{b64encode(b"jpeg").decode()}"' in films
+    heading = films.split("<h3")[1].split("</h3>")[0].split(">")[1]
+    assert len(heading) < 120
+    assert films.count("<h3") == films.count("<figure>") == 1
+
+
+def test_without_filmstrips_there_are_only_tables() -> None:
+    record = read(values(3, "dropped"))
+    section = samples.section(Report([], [Sample("act", record, Path("a.jsonl"), 7)]))
+    assert section.figures == "" and len(section.tables) == 1
 
 
 # Published figures

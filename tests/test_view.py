@@ -25,6 +25,7 @@ from lerobot_bomb.commands import main as cli
 from lerobot_bomb.envs.rollout import expert_agent, make_env, run_episode
 from lerobot_bomb.viewing.bomb import bomb_episode
 from lerobot_bomb.viewing.episode import ViewedRun, write_episodes
+from lerobot_bomb.viewing.sheet import BAR_HEIGHT, title_bar
 from lerobot_env_bomb.env import BombEnv
 
 SPEC = EpisodeSpec(seed=4, target=(3, 2), color="white", fps=5)
@@ -158,9 +159,12 @@ def test_the_video_shows_every_moment(viewed: Path, run: Run) -> None:
         assert (stream.codec_context.name, stream.pix_fmt, stream.average_rate) == ("h264", "yuv420p", 5)
         frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(stream)]
     assert len(frames) == len(run.actions) + 1
-    for frame, image in zip(frames, run.images, strict=True):
+    title = title_bar("expert, place, none, seed 4", frames[0].shape[1])
+    shown = [frame[BAR_HEIGHT:] for frame in frames]
+    for frame, image in zip(shown, run.images, strict=True):
         assert psnr(frame, image) > 30
-    assert psnr(frames[-2], run.images[-1]) < psnr(frames[-1], run.images[-1]) - 3
+    assert psnr(shown[-2], run.images[-1]) < psnr(shown[-1], run.images[-1]) - 3
+    assert all(psnr(frame[:BAR_HEIGHT], title) > 25 for frame in frames)
 
 
 def psnr(one: np.ndarray, other: np.ndarray) -> float:

@@ -29,6 +29,12 @@ def shipped_checkpoint(name: str) -> Path:
     return FOLDER / name
 
 
+def shipped_name(path: str) -> str | None:
+    """Return `bomb:NAME` for the folder of a shipped checkpoint; None for any other path."""
+    folder = Path(path)
+    return f"{PREFIX}{folder.name}" if folder.parent == FOLDER and folder.name in shipped_names() else None
+
+
 def checkpoint_path(text: str) -> str:
     """Return a checkpoint's path: for `bomb:NAME` its folder, anything else unchanged.
 

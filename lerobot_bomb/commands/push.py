@@ -1,6 +1,7 @@
 """``lerobot-bomb push``: a checkpoint or a recorded dataset, with its card, to the Hub."""
 
 import argparse
+import sys
 
 from lerobot_bomb.checkpoints.names import CONFIG, TRAIN_CONFIG
 from lerobot_bomb.commands.arguments import path_flag, switch
@@ -67,6 +68,7 @@ def _push_checkpoint(args: argparse.Namespace) -> int:
     from lerobot_bomb.data.facts import DatasetFacts
     from lerobot_bomb.hub.evaluated import check_environment_of, check_weights_of
     from lerobot_bomb.hub.push import publish, read_checkpoint
+    from lerobot_bomb.hub.rates import FIGURE
     from lerobot_bomb.hub.upload import check_token
 
     dataset = None if args.dataset_root is None else DatasetFacts.read(args.dataset_root)
@@ -81,7 +83,10 @@ def _push_checkpoint(args: argparse.Namespace) -> int:
     for path, rows in zip(args.results, results, strict=True):
         check_environment_of(path, rows, checkpoint.environment)
     if args.dry_run:
-        print(checkpoint.card(), *sorted(files), sep="\n")
+        names = [*files, *([FIGURE] if results else [])]
+        print(checkpoint.card(), *sorted(names), sep="\n")
+        if checkpoint.history.datasets:
+            print(f"not asked: is {checkpoint.history.datasets[0]} on the Hub?", file=sys.stderr)
         return 0
     print(publish(checkpoint, files, args.private or None).commit_url)
     return 0

@@ -29,13 +29,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--output", type=path_flag, default=DEFAULT, help=f"page (default: {DEFAULT})")
     add("--title", help="title of the page (default: the policies, tasks and number of episodes)")
     add_names_flag(parser)
-    videos = "replay this many failures of each class, and show their videos (default: 0)"
+    films = "replay this many failures of each class, and show filmstrips of them (default: 0)"
+    add("--films", type=int, metavar="N", default=0, help=films)
+    videos = "the same with videos beside the filmstrips (default: 0)"
     add("--videos", type=int, metavar="N", default=0, help=videos)
 
 
 def run(args: argparse.Namespace) -> int:
     """Write FILE.html, FILE.json and FILE.csv, and videos; print their paths."""
-    check_at_least(args, videos=0)
+    check_at_least(args, films=0, videos=0)
     output = args.output / DEFAULT if args.output.is_dir() else args.output
     if output.suffix not in ("", ".html"):
         raise ValueError(f"--output={output} must be the page's path, .html, or a folder")
@@ -45,10 +47,10 @@ def run(args: argparse.Namespace) -> int:
     records = [record for file in files.values() for record in file.records]
     groups = groups_of(records, names_of(args.names, records))
     numbered = {path: file.numbered for path, file in files.items()}
-    samples = list(sample_failures(groups, numbered, max(NUM_SAMPLES, args.videos)))
+    samples = list(sample_failures(groups, numbered, max(NUM_SAMPLES, args.films, args.videos)))
     folder = page.with_name(f"{page.stem}_videos")
-    if args.videos:
-        samples = _add_videos(samples, folder, args.videos)
+    if args.films or args.videos:
+        samples = _add_pictures(samples, folder, args.films, args.videos)
     missing = [file.missing for file in files.values() if file.missing]
     missing += [
         f"{path}: {file.num_damaged} damaged records are not counted"
@@ -65,14 +67,15 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_videos(samples: list[Sample], folder: Path, num_of_class: int) -> list[Sample]:
-    from lerobot_bomb.report.videos import with_videos  # LeRobot and rerun: seconds
+def _add_pictures(samples: list[Sample], folder: Path, num_films: int, num_videos: int) -> list[Sample]:
+    from lerobot_bomb.report.videos import with_pictures  # LeRobot and rerun: seconds
 
-    shown = list(tqdm(with_videos(samples, folder, num_of_class), total=len(samples), unit=" failures"))
-    missing = [each for each in shown if each.note and not each.video]
+    pictured = with_pictures(samples, folder, num_films, num_videos)
+    shown = list(tqdm(pictured, total=len(samples), unit=" failures"))
+    missing = [each for each in shown if each.note and not each.film]
     if missing:
         print(
-            f"videos that are missing: {len(missing)}, as {missing[0].command}: {missing[0].note}",
+            f"failures that could not be shown: {len(missing)}, as {missing[0].command}: {missing[0].note}",
             file=sys.stderr,
         )
     return shown

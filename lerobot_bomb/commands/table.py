@@ -20,9 +20,10 @@ Datasets and episodes
   convert libero-hdf5: make a LeRobotDataset of LIBERO's demonstrations, TASK_demo.hdf5 or a folder of them
     $ libero_spatial --repo_id=me/libero --root=data/libero
     $ libero_spatial --repo_id=me/moves --root=data/moves --skip_noops --images
-  view: run one episode; write a recording for Rerun and a video
+  view: run one episode, or draw a dataset's; write a recording for Rerun and a video, or a sheet
     $ --policy.path=bomb:vla0_smol
     $ --seed=9 --env.perturbations=camera:3+light:2
+    $ --dataset=data/bomb --episodes=0,5,7 --output=outputs/bomb.png
   view gallery: draw every perturbation axis, or a suite's tasks
     $ --axes=camera,light --seeds=2,3
     $ --env.task=object --output=outputs/tasks
@@ -45,7 +46,7 @@ Results
     $ outputs/sweep/results.jsonl --non_inferior=5
   report: write results files as one page, with tables as JSON and CSV
     $ results.jsonl
-    $ vla0_smol.jsonl fdvla.jsonl --output=outputs/report.html --videos=1
+    $ vla0_smol.jsonl fdvla.jsonl --output=outputs/report.html --films=2
   export: write results files as a LaTeX table, a model-index and the Hub's .eval_results
     $ results.jsonl
     $ vla0_smol.jsonl fdvla.jsonl --output=outputs/paper

@@ -1,4 +1,4 @@
-"""``lerobot-bomb view``: one episode as a recording for Rerun's viewer and as a video."""
+"""``lerobot-bomb view``: an episode as a recording for Rerun and a video, or recorded ones as a sheet."""
 
 import argparse
 from collections.abc import Iterator
@@ -17,8 +17,11 @@ from lerobot_bomb.commands.arguments import (
     add_env_flag,
     add_episode_arguments,
     add_episode_files_argument,
+    parse_numbers,
+    path_flag,
     switch,
 )
+from lerobot_bomb.commands.view_dataset import NUM_EPISODES, view_dataset
 from lerobot_bomb.environments import BOMB, ENVIRONMENTS
 from lerobot_bomb.envs.rollout import Agent, expert_agent, one_of_batch, random_agent
 from lerobot_bomb.files import read_json
@@ -45,6 +48,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=int, default=0, help="seed of the episode (default: 0)")
     add_viewed_arguments(parser)
     add_episode_files_argument(parser, DEFAULT_FOLDER)
+    recorded = "show episodes of this LeRobotDataset instead: a sheet (--output=x.png) or a video (x.mp4)"
+    add("--dataset", type=path_flag, metavar="ROOT", help=recorded)
+    numbers = f"of --dataset: which episodes, as 0,5,7 (default: {NUM_EPISODES}, spread over all)"
+    add("--episodes", type=parse_numbers, help=numbers)
+    parser.set_defaults(defaults=vars(parser.parse_args([])))
 
 
 def add_viewed_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,6 +79,10 @@ def _viewed_types() -> list[str]:
 
 def run(args: argparse.Namespace) -> int:
     """Run an episode, write both files, print the instruction, the outcome and the paths."""
+    if args.dataset is not None:
+        return view_dataset(args, args.defaults, DEFAULT_FOLDER)
+    if args.episodes is not None:
+        raise ValueError(f"--episodes={','.join(map(str, args.episodes))} needs --dataset=ROOT")
     viewed = viewed_of(args)
     policy = _policy(args, viewed.policies)
     name = viewed.name(policy)

@@ -56,6 +56,11 @@ class DatasetFacts:
         return self.bomb.get("recording", {})
 
     @property
+    def conversion(self) -> dict[str, Any]:
+        """Parameters of `lerobot-bomb convert`, or {}."""
+        return self.bomb.get("conversion", {})
+
+    @property
     def environment(self) -> Environment | None:
         """BOMB environment of the dataset; None if it has another."""
         return Environment.of_dataset(self.info, *self._tasks)
@@ -73,7 +78,7 @@ class DatasetFacts:
 
     def eval_flags(self) -> list[str] | None:
         """Return lerobot-eval's flags for the dataset's environment; None if unknown."""
-        conversion = self.bomb.get("conversion", {})
+        conversion = self.conversion
         if conversion.get("source", "").startswith(PUSHT_SOURCE):
             return ["--env.type=pusht", "--eval.use_async_envs=false"]
         if conversion.get("source", "").startswith(LIBERO_SOURCE):
@@ -88,9 +93,20 @@ class DatasetFacts:
 
     def lines(self) -> list[str]:
         """Return what was recorded, as items of a list; `plain` makes them safe for Markdown."""
+        return [f"- {self.count}", *self._recording_lines()]
+
+    @property
+    def count(self) -> str:
+        """Episodes, frames and rate in words."""
         info = self.info
-        count = f"{info['total_episodes']} episodes, {info['total_frames']} frames at {info['fps']} Hz"
-        return [f"- {count}", *self._recording_lines()]
+        return f"{info['total_episodes']} episodes, {info['total_frames']} frames at {info['fps']} Hz"
+
+    @property
+    def perturbations(self) -> list[str] | None:
+        """Conditions of the episodes; None if unknown."""
+        if self.recording:
+            return list(self.recording["perturbations"])
+        return None if self.specs is None else sorted({spec["perturbations"] for spec in self.specs})
 
     @property
     def seeds(self) -> Sequence[int] | None:

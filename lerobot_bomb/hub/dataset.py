@@ -1,5 +1,6 @@
 """Publishing of a recorded dataset, with its card, on the Hub."""
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,11 +8,13 @@ from pathlib import Path
 from huggingface_hub import CommitInfo, DatasetCardData, HfApi
 from huggingface_hub.errors import RevisionNotFoundError
 
+from lerobot_bomb.conditions import NONE
 from lerobot_bomb.data.dataset_files import check_dataset
 from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.data.statistics import check_statistics
 from lerobot_bomb.data.unfinished import METADATA_FILE
 from lerobot_bomb.hub.markdown import code, command, fenced, plain
+from lerobot_bomb.hub.method import BOMB
 from lerobot_bomb.hub.push import CARD
 from lerobot_bomb.hub.upload import check_token, hub_errors, upload
 
@@ -76,17 +79,32 @@ def _is_data(path: str) -> bool:
 
 
 def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
-    """Write the dataset's card: its content, and how to train on it."""
+    """Write the dataset's card: its content, how to use it, what it does not hold, whom to cite."""
     metadata = DatasetCardData(
-        license="apache-2.0",
+        # of episodes that this package simulated; a converted dataset keeps its own, which no file tells
+        license="apache-2.0" if facts.recording else None,
         tags=["LeRobot", "lerobot_bomb"],
         task_categories=["robotics"],
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
-    rows = [
-        f"| {code(name)} | {feature['dtype']} | {tuple(feature['shape'])} |"
-        for name, feature in facts.info["features"].items()
-    ]
+    written = "converted" if facts.conversion else "recorded"
+    sections = {
+        "Use": _use(repo_id, facts),
+        "What it does not hold": "\n".join(f"- {each}" for each in _limits(facts)),
+        "Features": _features(facts),
+        "Citation": _citation(facts),
+    }
+    lines = "\n".join(map(plain, facts.lines()))
+    start = (
+        f"# {repo_id.split('/')[-1]}\n\nA LeRobotDataset {facts.info['codebase_version']}, {written} by "
+        f"`lerobot-bomb`.\n\n{lines}\n"
+    )
+    text = start + "".join(f"\n## {title}\n\n{section}\n" for title, section in sections.items())
+    return f"---\n{metadata.to_yaml()}\n---\n\n{text}"
+
+
+def _use(repo_id: str, facts: DatasetFacts) -> str:
+    """Install, train and evaluate, as Markdown."""
     train = command(
         "lerobot-train",
         f"--dataset.repo_id={repo_id}",
@@ -94,32 +112,35 @@ def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
         "--policy.push_to_hub=false",
         "--output_dir=outputs/train",
     )
-    flags = facts.eval_flags() or []
-    evaluate = command(
-        "lerobot-eval", "--policy.path=outputs/train/checkpoints/last/pretrained_model", *flags
-    )
-    lines = [
-        f"# {repo_id.split('/')[-1]}",
-        "",
-        f"A LeRobotDataset {facts.info['codebase_version']}, written by `lerobot-bomb`.",
-        "",
-        *map(plain, facts.lines()),
-        "",
-        "## Use",
-        "",
-        "`pip install .` in a checkout of lerobot_bomb adds its environment and its policy types to LeRobot; "
-        "TYPE is one of these, or of LeRobot's own.",
-        "",
-        fenced(f"{train}\n{evaluate}"),
-        "",
-        "## Features",
-        "",
-        "| feature | type | shape |",
-        "|---|---|---|",
-        *rows,
-        "",
+    last = "--policy.path=outputs/train/checkpoints/last/pretrained_model"
+    flags = facts.eval_flags()
+    lines = ["pip install .  # in a checkout of lerobot_bomb", train]
+    lines += [] if flags is None else [command("lerobot-eval", last, *flags)]
+    return f"{fenced('\n'.join(lines))}\n\nTYPE is a policy type of lerobot_bomb, or of LeRobot's own."
+
+
+def _limits(facts: DatasetFacts) -> Iterator[str]:
+    shown = facts.perturbations
+    if shown == [NONE]:
+        yield "Perturbed scenes: all are unperturbed."
+    if facts.recording:
+        yield "Failed episodes: the scripted expert's successes alone were kept."
+        yield "A robot's own data: all of it is simulated."
+    if facts.conversion:
+        yield f"A licence: that of its source holds ({plain(facts.conversion['source'])})."
+
+
+def _features(facts: DatasetFacts) -> str:
+    rows = [
+        f"| {code(name)} | {feature['dtype']} | {tuple(feature['shape'])} |"
+        for name, feature in facts.info["features"].items()
     ]
-    return f"---\n{metadata.to_yaml()}\n---\n\n" + "\n".join(lines)
+    return "\n".join(["| feature | type | shape |", "|---|---|---|", *rows])
+
+
+def _citation(facts: DatasetFacts) -> str:
+    theirs = " and the authors of the demonstrations that it was converted from" if facts.conversion else ""
+    return f"Cite lerobot_bomb{theirs}:\n\n{fenced(BOMB.bibtex(), 'bibtex')}"
 
 
 def _tag(repo_id: str, version: str) -> None:

@@ -8,6 +8,7 @@ from huggingface_hub import EvalResult, EvalResultEntry, eval_result_entries_to_
 from huggingface_hub.repocard_data import eval_results_to_model_index
 
 from lerobot_bomb.conditions import AxisCondition
+from lerobot_bomb.hub.rates import suite_of
 from lerobot_bomb.results.groups import Group, by_condition, differing, rate_of
 from lerobot_bomb.results.record import Record
 
@@ -19,13 +20,14 @@ def model_index(groups: list[Group]) -> list[EvalResult]:
     return [
         EvalResult(
             task_type="robotics",
-            task_name=_task(records[0]),
+            task_name=suite_of(records[0]),
             dataset_type=group.record_type.env_type,
             dataset_name=group.records[0].benchmark(),
             dataset_config=_config(condition, records),  # tells results apart, which their task does not
             metric_type=METRIC,
-            metric_name=f"success rate, {_counted(records)}",
+            metric_name="success rate",
             metric_value=_share(records),
+            metric_args=_count_of(records),
         )
         for group, condition, records in _conditions(groups)
     ]
@@ -55,10 +57,10 @@ def check_one_rate_each(groups: list[Group]) -> None:
     """Raise a ValueError if a policy has two rates for one condition, of episodes that must not be pooled."""
     first: dict[tuple[str, AxisCondition], Group] = {}
     for group, condition, records in _conditions(groups):
-        other = first.setdefault((_task(records[0]), condition), group)
+        other = first.setdefault((suite_of(records[0]), condition), group)
         if other is not group:
             raise ValueError(
-                f"{records[0].describe_policy()} has two rates for {_task(records[0])}, {condition}: the "
+                f"{records[0].describe_policy()} has two rates for {suite_of(records[0])}, {condition}: the "
                 f"episodes differ in {', '.join(differing([other, group]))}; export the records of one"
             )
 
@@ -71,15 +73,18 @@ def _conditions(groups: list[Group]) -> Iterator[tuple[Group, AxisCondition, lis
 
 def _config(condition: AxisCondition, records: list[Record]) -> str:
     """Return the task and condition as `place.camera-3`."""
-    return f"{_task(records[0])}.{condition.key}"
-
-
-def _task(record: Record) -> str:
-    return getattr(record.spec, "suite", record.tasks[0])
+    return f"{suite_of(records[0])}.{condition.key}"
 
 
 def _share(records: list[Record]) -> float:
     return rate_of(records).share
+
+
+def _count_of(records: list[Record]) -> dict[str, Any]:
+    """Return what a rate is of: successes, episodes, and the interval's bounds and method."""
+    rate = rate_of(records)
+    interval = None if rate.interval is None else [round(bound, 4) for bound in rate.interval]
+    return {"successes": rate.successes, "episodes": rate.n, "interval": interval, "method": rate.method}
 
 
 def _counted(records: list[Record]) -> str:

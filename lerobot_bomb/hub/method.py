@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from lerobot_bomb import __version__
+
 
 @dataclass(frozen=True)
 class Paper:
@@ -12,16 +14,28 @@ class Paper:
     authors: str
     year: int | None = None
     arxiv: str | None = None
+    version: str | None = None  # of software
 
     def bibtex(self) -> str:
         """Return a BibTeX entry."""
         entry = {"title": f"{{{self.title}}}", "author": self.authors}
         if self.year is not None:
             entry["year"] = str(self.year)
+        if self.version is not None:
+            entry["version"] = self.version
         if self.arxiv is not None:
             entry |= {"eprint": self.arxiv, "archivePrefix": "arXiv"}
         fields = ",\n".join(f"  {name} = {{{value}}}" for name, value in entry.items())
         return f"@misc{{{self.key},\n{fields}\n}}"
+
+
+# as CITATION.cff has it
+BOMB = Paper(
+    "lerobot_bomb",
+    "BOMB: a precise placement benchmark and vision-language-action policies for LeRobot",
+    r"{The lerobot\_bomb authors}",
+    version=__version__,
+)
 
 
 @dataclass(frozen=True)

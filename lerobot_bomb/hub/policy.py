@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, ClassVar, cast
@@ -28,7 +29,7 @@ from lerobot_bomb.data.statistics import mending, wrong_statistics
 from lerobot_bomb.finite import require_finite_statistics
 from lerobot_bomb.hub.card import Checkpoint
 from lerobot_bomb.hub.method import Method
-from lerobot_bomb.hub.push import publish
+from lerobot_bomb.hub.push import num_parameters, publish
 from lerobot_bomb.training.distributed import process_number
 
 # arguments that say how a file is fetched from the Hub
@@ -171,7 +172,6 @@ class HubPolicy:
             config=self.config,
             method=self.method,
             repo_id=self.config.repo_id,
-            dataset_id=cfg.dataset.repo_id,
             training=cfg,
             dataset=None if dataset_meta is None else DatasetFacts.find(dataset_meta.root),
             license=self.config.license,
@@ -192,7 +192,9 @@ class HubPolicy:
             for name in PROCESSORS:
                 if (last / name).is_file():
                     files |= {each: last / each for each in processor_files(last, name)}
-            check_finite(next(files[name] for name in (ADAPTERS[1], WEIGHTS) if name in files))
+            weights = next(files[name] for name in (ADAPTERS[1], WEIGHTS) if name in files)
+            check_finite(weights)
+            card = replace(card, num_parameters=num_parameters(weights))
             commit = publish(card, files, self.config.private)
         # LeRobot's remote jobs wait for this line
         logging.info(f"Model pushed to {commit.repo_url.url}")

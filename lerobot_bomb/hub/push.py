@@ -3,12 +3,22 @@
 import json
 from collections.abc import Mapping
 from copy import copy
+from dataclasses import replace
+from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lerobot_bomb.checkpoints.names import CONFIG, TO_PUBLISH, TRAIN_CONFIG, WEIGHTS, is_local_path
+from lerobot_bomb.checkpoints.names import (
+    CONFIG,
+    TO_PUBLISH,
+    TRAIN_CONFIG,
+    WEIGHTS,
+    is_hub_id,
+    is_local_path,
+)
 from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.files import read_json
+from lerobot_bomb.hub.rates import FIGURE
 from lerobot_bomb.results.record import Record
 
 if TYPE_CHECKING:
@@ -33,12 +43,18 @@ def publish(checkpoint: "Checkpoint", files: Mapping[str, Path], private: bool |
 
     from lerobot_bomb.hub.upload import hub_errors, upload
 
-    card, base = checkpoint.card(), checkpoint.adapters_of
+    base = checkpoint.adapters_of
     with hub_errors(checkpoint.repo_id):
+        names = filter(is_hub_id, checkpoint.history.datasets)
+        on_hub = frozenset(name for name in names if HfApi().repo_exists(name, repo_type="dataset"))
+        card = replace(checkpoint, on_hub=on_hub).card()
         if base is not None and not HfApi().file_exists(base, CONFIG):
             raise RuntimeError(f"the base of these adapters, {base}, is not on the Hub; {TO_PUBLISH}")
         card.validate()
     contents: dict[str, Path | bytes] = {**files, CARD: str(card).encode()}
+    figure = checkpoint.figure()
+    if figure is not None:
+        contents[FIGURE] = figure
     for name in {CONFIG, TRAIN_CONFIG} & files.keys():
         contents[name] = portable_json(files[name]).encode()
     message = f"{checkpoint.config.type}: weights, processors, configs and card"
@@ -47,7 +63,7 @@ def publish(checkpoint: "Checkpoint", files: Mapping[str, Path], private: bool |
 
 def _is_of_checkpoint(path: str) -> bool:
     """Return True for a file of the checkpoint itself: LeRobot keeps earlier pushes in folders."""
-    return "/" not in path and path.endswith((".json", ".safetensors"))
+    return "/" not in path and (path == FIGURE or path.endswith((".json", ".safetensors")))
 
 
 def read_checkpoint(
@@ -65,6 +81,7 @@ def read_checkpoint(
         policy_class,
     )
     from lerobot_bomb.checkpoints.folder import parse_config
+    from lerobot_bomb.checkpoints.training import dataset_of
     from lerobot_bomb.hub.card import Checkpoint
 
     register_third_party_plugins()
@@ -82,19 +99,26 @@ def read_checkpoint(
         check_finite(folder / WEIGHTS)
     training = _read_training(folder)
     if dataset is None and training is not None:  # it may still be where the training found it
-        dataset = DatasetFacts.find(training.dataset.root)
+        dataset = DatasetFacts.find(dataset_of(training.to_dict()))
     return Checkpoint(
         config=config,
         method=policy_type.method,
         repo_id=repo_id,
-        dataset_id=training.dataset.repo_id if training is not None else None,
         training=training,
         dataset=dataset,
         results=results,
         license=config.license,
         tags=config.tags or [],
         adapters_of=base,
+        num_parameters=num_parameters(folder / (WEIGHTS if base is None else ADAPTERS[1])),
     )
+
+
+def num_parameters(path: Path) -> int:
+    """Count the numbers in a file of weights."""
+    from lerobot_bomb.checkpoints.checks import tensor_shapes
+
+    return sum(prod(shape) for shape in tensor_shapes(path).values())
 
 
 def _check_processors(folder: Path, config: "PreTrainedConfig") -> None:

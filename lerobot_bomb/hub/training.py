@@ -8,7 +8,7 @@ import draccus
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 
-from lerobot_bomb.checkpoints.names import has_local_path, is_hub_id
+from lerobot_bomb.checkpoints.names import has_local_path
 from lerobot_bomb.hub.markdown import command
 
 # a policy's fields that the code fills in, or that say where it runs and is published
@@ -37,12 +37,15 @@ NOT_FLAGS = {
 }
 
 
-def train_command(config: PreTrainedConfig, training: TrainPipelineConfig | None, dataset_id: str) -> str:
-    """Return the command that trained the checkpoint, without local paths."""
-    start = f"--policy.type={config.type}"
-    if config.pretrained_path and is_hub_id(config.pretrained_path):
-        start = f"--policy.path={config.pretrained_path}"
-    flags = [start, *_flags_of(config, "policy"), f"--dataset.repo_id={dataset_id}"]
+def train_command(
+    config: PreTrainedConfig, training: TrainPipelineConfig | None, start: str | None, dataset_id: str
+) -> str:
+    """Return the command of a checkpoint's last training, without local paths.
+
+    `start`: the checkpoint that it started from; None: it started from the type's own weights.
+    """
+    first = f"--policy.type={config.type}" if start is None else f"--policy.path={start}"
+    flags = [first, *_flags_of(config, "policy"), f"--dataset.repo_id={dataset_id}"]
     if training is not None:
         if training.dataset.episodes is not None:
             flags.append(f"--dataset.episodes={_text(training.dataset.episodes)}")

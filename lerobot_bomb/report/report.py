@@ -22,6 +22,7 @@ class Sample:
     path: Path  # of its file
     line: int  # of the file, from 1 on
     video: str | None = None  # link from the page
+    film: bytes | None = None  # JPEG of the episode's filmstrip
     note: str = ""  # why there is none, or what is to be known of it
 
     @property

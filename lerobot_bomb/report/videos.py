@@ -1,6 +1,7 @@
-"""Videos of failures, beside the page that shows them."""
+"""Videos and filmstrips of failures: videos beside the page that shows them, filmstrips in it."""
 
 import hashlib
+import io
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -8,40 +9,61 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import quote
 
+import numpy as np
+from PIL import Image
+
 from lerobot_bomb.report.report import Sample
 from lerobot_bomb.results.record import Record, different_fields
-from lerobot_bomb.viewing.episode import write_episodes
+from lerobot_bomb.viewing.episode import write_episode_with_film
+from lerobot_bomb.viewing.film import film_of
 from lerobot_bomb.viewing.replay import Replay
 
+JPEG_QUALITY = 80  # of a filmstrip: a page with 40 of them is still sent as one file
 
-def with_videos(samples: Iterable[Sample], folder: Path, num_of_class: int) -> Iterator[Sample]:
-    """Add a video, beside the page, to the first samples of each group's classes; yield the others unchanged.
 
-    Where an episode cannot be run again, its note says why.
+def with_pictures(
+    samples: Iterable[Sample], folder: Path, num_films: int, num_videos: int
+) -> Iterator[Sample]:
+    """Add pictures to the first samples of each group's classes; yield the others unchanged.
+
+    The first `num_videos` of a class get a video in `folder` and a filmstrip, those up to `num_films` a
+    filmstrip alone. Where an episode cannot be run again, its note says why.
     """
     numbers = Counter[tuple[str, str]]()
     for sample in samples:
         group_class = sample.group, str(sample.record.failure)
         numbers[group_class] += 1
-        yield sample if numbers[group_class] > num_of_class else _with_video(sample, folder)
+        number = numbers[group_class]
+        yield sample if number > max(num_films, num_videos) else _run(sample, folder, number <= num_videos)
 
 
-def _with_video(sample: Sample, folder: Path) -> Sample:
+def _run(sample: Sample, folder: Path, has_video: bool) -> Sample:
+    """Run a sample's episode again, and return the sample with its pictures."""
     record = sample.record
-    digest = hashlib.sha256(json.dumps(record.as_json(), sort_keys=True).encode()).hexdigest()
-    path = folder / f"{record.failure}-seed{record.spec.seed}-{digest[:8]}.mp4"
+    path = folder / _file_name(record) if has_video else None
     try:
-        different = _write_video(record, path)
-    except Exception as error:  # whatever it is: the page says it in the video's place
+        run = Replay(record).viewed_run()
+        if path is None:
+            film, result = film_of(run)
+        else:
+            recording = path.with_suffix(".rrd")
+            result, film = write_episode_with_film(run, path.stem, recording, path)
+            recording.unlink()
+    except Exception as error:  # whatever it is: the page says it in the pictures' place
         lines = str(error).strip().splitlines() or [type(error).__name__]
-        return replace(sample, note=f"no video: {lines[-1]}")
+        return replace(sample, note=f"no {'video' if has_video else 'filmstrip'}: {lines[-1]}")
+    different = different_fields(record, result)
     note = f"not as recorded: {different[0]} differs" if different else ""
-    return replace(sample, video=quote(f"{folder.name}/{path.name}"), note=note)
+    video = None if path is None else quote(f"{folder.name}/{path.name}")
+    return replace(sample, video=video, film=_jpeg(film), note=note)
 
 
-def _write_video(record: Record, path: Path) -> list[str]:
-    """Write the video of a record's episode; return the names of fields that differ from the record."""
-    recording = path.with_suffix(".rrd")
-    (result,) = write_episodes({"": Replay(record).viewed_run()}, path.stem, recording, path)
-    recording.unlink()
-    return different_fields(record, result)
+def _file_name(record: Record) -> str:
+    digest = hashlib.sha256(json.dumps(record.as_json(), sort_keys=True).encode()).hexdigest()
+    return f"{record.failure}-seed{record.spec.seed}-{digest[:8]}.mp4"
+
+
+def _jpeg(film: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(film).save(file, format="jpeg", quality=JPEG_QUALITY, subsampling=0, optimize=True)
+    return file.getvalue()

@@ -2,8 +2,9 @@
 
 from collections.abc import Iterator, Mapping
 from functools import lru_cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import gymnasium
 import numpy as np
 from PIL import Image, ImageDraw
 
@@ -24,6 +25,9 @@ from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.record import NOT_RECORDED
 from lerobot_bomb.viewing.episode import EXPERT, RANDOM, EnvView, Viewed
 from lerobot_bomb.viewing.sheet import FONT_SIZE, GAP, INK, TILE_PAPER, font, text_tile
+
+if TYPE_CHECKING:
+    from lerobot_bomb.viewing.film import Shot
 
 SPEC_FLAGS = ("robot", "split", "control_mode", "fps", "target", "color", "success_tolerance_mm")
 GRID_RGB, NOMINAL_RGB, PATH_RGB = (200, 185, 160), (165, 165, 165), (210, 40, 30)
@@ -50,6 +54,16 @@ class BombView(EnvView):
         is_told = record.render_preset != NOT_RECORDED
         preset = record.render_preset if is_told else RenderOptions.preset
         return bomb_episode(spec, RenderOptions(record.image_size, preset, depth))
+
+    def shot(self, env: gymnasium.Env, moment: Moment) -> "Shot":
+        from lerobot_bomb.viewing.bomb_film import bomb_shot
+
+        return bomb_shot(env, moment)
+
+    def contact(self, moment: Moment) -> str:
+        from lerobot_bomb.viewing.bomb_film import bomb_contact
+
+        return bomb_contact(moment)
 
 
 def bomb_episode(spec: EpisodeSpec, options: RenderOptions) -> Viewed:

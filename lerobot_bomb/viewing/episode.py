@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 import gymnasium
 import numpy as np
 
-from lerobot_bomb.envs.rollout import Agent, run_episode
+from lerobot_bomb.environments import env_type
+from lerobot_bomb.envs.rollout import Agent, Moment, run_episode
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.results.record import Record, Spec
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
+    from lerobot_bomb.viewing.film import Shot
     from lerobot_bomb.viewing.rerun_file import EpisodeLog
 
 EXPERT, RANDOM = "expert", "random"
@@ -44,6 +46,13 @@ class Viewed:
         """Class that writes its recording."""
         return resolve_name(self.log_at)
 
+    @property
+    def title(self) -> str:
+        """Name an episode for people: "place, camera:3, seed 9"."""
+        suite = getattr(self.spec, "suite", None)
+        words = [*([suite] if suite else []), self.spec.perturbations, f"seed {self.spec.seed}"]
+        return ", ".join(words)
+
     def name(self, policy: str) -> str:
         """Name an episode and its files: "place.camera-3_expert_seed0"."""
         return f"{self.group}{self.task}_{policy}_seed{self.spec.seed}"
@@ -63,6 +72,16 @@ class EnvView(ABC):
     def of_record(self, record: Any, spec: Any, depth: bool) -> Viewed:
         """Return a spec's episode, shown like a record's, with depth if the policy saw it."""
 
+    def shot(self, env: gymnasium.Env, moment: Moment) -> "Shot":
+        """Return the images of a moment for a filmstrip."""
+        from lerobot_bomb.viewing.film import Shot
+
+        return Shot({"camera": np.asarray(env.render())})
+
+    def contact(self, moment: Moment) -> str:
+        """Name the furthest contact with an object so far, as "grasp"; '' if none is known."""
+        return ""
+
 
 @dataclass(frozen=True)
 class ViewedRun:
@@ -76,36 +95,67 @@ def write_episodes(runs: Mapping[str, ViewedRun], name: str, rrd: Path, mp4: Pat
     """Run the episodes one after the other, write recording and video, and return each result.
 
     The entities of a single run are at the recording's top; those of several are below their names. The video
-    shows several side by side, and repeats the last image of an episode until the others have ended.
+    shows several side by side, each below its name, condition and seed, and repeats the last image of an
+    episode until the others have ended.
     """
+    results, _ = _write_episodes(runs, name, rrd, mp4, with_films=False)
+    return results
+
+
+def write_episode_with_film(run: ViewedRun, name: str, rrd: Path, mp4: Path) -> tuple[Record, np.ndarray]:
+    """Write one episode as `write_episodes` does; return its result and its filmstrip, (H, W, 3) uint8."""
+    (result,), (film,) = _write_episodes({"": run}, name, rrd, mp4, with_films=True)
+    return result, film
+
+
+def _write_episodes(
+    runs: Mapping[str, ViewedRun], name: str, rrd: Path, mp4: Path, with_films: bool
+) -> tuple[list[Record], list[np.ndarray]]:
+    from lerobot_bomb.viewing.film import Film, draw_film
     from lerobot_bomb.viewing.rerun_file import open_recording
-    from lerobot_bomb.viewing.video import VideoFile, packed, unpacked
+    from lerobot_bomb.viewing.video import packed
 
     prefixes = {label: f"{label}/" if len(runs) > 1 else "" for label in runs}
     fps = next(iter(runs.values())).viewed.fps
     results: list[Record] = []
-    images: list[list[np.ndarray]] = []
+    films: list[np.ndarray] = []
+    images: dict[str, list[np.ndarray]] = {}
     with (
         written_whole(rrd, mp4) as (unfinished_rrd, unfinished_mp4),
         open_recording(unfinished_rrd, name, fps, _layout(runs, prefixes)) as recording,
     ):
         for label, run in runs.items():
             log = run.viewed.log(recording, prefixes[label], run.viewed.spec)
-            images.append([])
+            title = ", ".join(filter(None, (label, run.viewed.title)))
+            images[title] = []
             with closing(run.viewed.make_env()) as env, run.make_agent(env) as agent:
+                film = Film(env_type(run.viewed.env_type).view, env) if with_films else None
                 for moment in run_episode(env, run.viewed.spec, agent):
                     log.add(moment)
-                    images[-1].append(packed(cast("np.ndarray", env.render())))
+                    images[title].append(packed(cast("np.ndarray", env.render())))
+                    if film is not None:
+                        film.add(moment)
                 results.append(env.get_wrapper_attr("episode_result")())
             log.add_result(results[-1])
-        with VideoFile(unfinished_mp4, fps) as video:
-            for row in zip_longest(*images):
-                shown = [
-                    run_images[-1] if image is None else image
-                    for image, run_images in zip(row, images, strict=True)
-                ]
-                video.add(np.hstack([unpacked(image) for image in shown]))
-    return results
+            if film is not None:
+                films.append(draw_film(film, run, results[-1]))
+        _write_video(images, fps, unfinished_mp4)
+    return results, films
+
+
+def _write_video(images: Mapping[str, list[np.ndarray]], fps: int, path: Path) -> None:
+    """Write packed images of runs side by side, each below its title."""
+    from lerobot_bomb.viewing.sheet import title_bar
+    from lerobot_bomb.viewing.video import VideoFile, unpacked
+
+    bars = [title_bar(title, unpacked(first).shape[1]) for title, (first, *_) in images.items()]
+    with VideoFile(path, fps) as video:
+        for row in zip_longest(*images.values()):
+            shown = [
+                unpacked(run_images[-1] if image is None else image)
+                for image, run_images in zip(row, images.values(), strict=True)
+            ]
+            video.add(np.vstack([np.hstack(bars), np.hstack(shown)]))
 
 
 def paths_of(output: Path | None, folder: Path, name: str) -> list[Path]:

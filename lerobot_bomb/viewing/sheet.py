@@ -12,6 +12,7 @@ GAP = 4  # pixels between tiles
 FONT_SIZE, TITLE_SIZE = 12, 16  # pixels
 MIN_FONT_SIZE = 7  # pixels, of an instruction that is long for its tile
 LINE_HEIGHT, TITLE_HEIGHT = 18, 30  # pixels
+BAR_HEIGHT = 24  # pixels, even as videos need it
 PAPER, INK = (255, 255, 255), (20, 20, 20)
 TILE_PAPER = (244, 244, 240)
 
@@ -86,6 +87,21 @@ def caption(text: str, last_line: str, width: int) -> np.ndarray:
     lines, face = _fitted(text, width - 2 * GAP, lambda lines, _: lines.count("\n") < 2)
     pen.multiline_text((GAP, GAP), lines, INK, face, spacing=2)
     pen.text((GAP, GAP + 2 * LINE_HEIGHT), last_line, INK, font(FONT_SIZE))
+    return np.asarray(bar)
+
+
+def title_bar(text: str, width: int) -> np.ndarray:
+    """(H, width, 3) uint8: a text in one line, smaller if it is long, with an ellipsis if it is too long."""
+    room = width - 2 * GAP
+    sizes = range(FONT_SIZE, MIN_FONT_SIZE - 1, -1)
+    face = next((font(size) for size in sizes if font(size).getlength(text) <= room), font(MIN_FONT_SIZE))
+    if face.getlength(text) > room:
+        text = text[:width]
+        while text and face.getlength(f"{text}…") > room:
+            text = text[:-1]
+        text = f"{text}…"
+    bar = Image.new("RGB", (width, BAR_HEIGHT), TILE_PAPER)
+    ImageDraw.Draw(bar).text((GAP, GAP), text, INK, face)
     return np.asarray(bar)
 
 

@@ -50,11 +50,14 @@ RECORDING: dict[str, Any] = {
     "protocol_version": "1.0",
     "package_version": "0.1.0",
 }
+TRAINING = TrainPipelineConfig(DatasetConfig("me/d"), steps=7)
 BOMB = DatasetFacts(BOMB_INFO, {"recording": RECORDING, "num_episodes": 3, "failures": [{"seed": 6}]})
 
 
 def checkpoint(name: str = HUB_NAME, **options: Any) -> Checkpoint:
-    return Checkpoint(make_config(vlm_model_name=name, **options), VLA0, "me/x", "me/d")
+    return Checkpoint(
+        make_config(vlm_model_name=name, **options), VLA0, "me/x", TRAINING, on_hub=frozenset({"me/d"})
+    )
 
 
 def metadata(described: Checkpoint) -> dict[str, Any]:
@@ -68,7 +71,7 @@ def test_metadata_of_a_public_backbone() -> None:
         "pipeline_tag": "robotics",
         "tags": ["lerobot", "lerobot_bomb", "robotics", "vla0_smol"],
         "model_name": "vla0_smol",
-        "datasets": "me/d",
+        "datasets": ["me/d"],
         "base_model": HUB_NAME,
     }
 
@@ -101,7 +104,9 @@ def test_commands_are_those_of_the_training_and_of_what_the_dataset_shows(tmp_pa
     training = TrainPipelineConfig(
         DatasetConfig("me/d", root=str(tmp_path), episodes=[0, 1]), batch_size=4, steps=7, seed=3
     )
-    trained = replace(checkpoint(temporal_ensemble_size=0), training=training, dataset=BOMB)
+    trained = replace(
+        checkpoint(temporal_ensemble_size=0, trained_batches=7), training=training, dataset=BOMB
+    )
     text = str(trained.card()).replace(" \\\n    ", " ")
     assert (
         "lerobot-train --policy.type=vla0_smol --policy.chunk_size=3 --policy.n_action_steps=2 "
@@ -143,7 +148,7 @@ def test_names_in_an_environment_are_no_markup() -> None:
 def test_a_suite_that_is_not_known_is_not_made_up() -> None:
     unknown = checkpoint(environment=Environment("scara", "relative", 10, 64, ("wrist",), "1.0"))
     text = str(unknown.card())
-    assert "--env.task=SUITE" in text and "place" not in text
+    assert "--env.task=SUITE" in text and "suite place" not in text and "task=place" not in text
     assert "`SUITE` is that of its training, which the dataset does not say." in text
     assert "- environment: BOMB, task version 1.0, an unknown suite, robot scara" in text
     result = read(values(0, spec={"suite": "object"}, task_version="1.1", target=None))
@@ -207,6 +212,53 @@ def test_an_evaluation_on_pusht_is_a_table_of_coverage_and_failures() -> None:
 @pytest.mark.parametrize(("method", "source"), [(VLA0, "2510.13054"), (GRID, "2501.15830"), (FDVLA, "FDVLA")])
 def test_the_method_is_cited(method: Any, source: str) -> None:
     assert source in str(replace(checkpoint(), method=method).card())
+
+
+def test_a_dataset_is_named_as_one_of_the_hub_only_if_the_hub_has_it() -> None:
+    local = replace(checkpoint(trained_batches=7), on_hub=frozenset())
+    assert "datasets" not in metadata(local)
+    text = str(local.card())
+    assert "--dataset.repo_id=me/d" not in text
+    assert text.count("--dataset.repo_id=USER/NAME") == 2
+    assert "| `me/d`, a name on the machine of the training |" in text
+    there = str(checkpoint(trained_batches=7).card())
+    assert there.count("--dataset.repo_id=me/d") == 2
+    assert "USER/NAME" not in there and "| `me/d` | not known |" in there
+
+
+def test_random_weights_are_said_to_be_random() -> None:
+    text = str(checkpoint("nano", trained_batches=7).card())
+    assert "a small one, trained from random weights" in text
+    assert "All weights were random before the first training." in text
+    assert "a small one, of random weights" in str(checkpoint("nano").card())
+    assert f"Before the first training, its vision-language model was `{HUB_NAME}`." in str(
+        checkpoint(trained_batches=7).card()
+    )
+
+
+def test_the_card_says_what_the_checkpoint_cannot_do() -> None:
+    nominal = DatasetFacts(BOMB_INFO, {**BOMB.bomb, "recording": RECORDING | {"perturbations": ["none"]}})
+    trained = replace(checkpoint("nano", trained_batches=7), dataset=nominal, num_parameters=1234567)
+    text = str(trained.card())
+    for part in (
+        "with 1,234,567 parameters",
+        "- It acts only in the environment of its training: BOMB, task version 1.0, suite place, robot fetch",
+        "- Its model is small and was never trained on anything else",
+        "- No training showed it perturbed scenes.",
+        "- How often it succeeds is not known: no evaluation is attached.",
+        "nothing on a robot.",
+    ):
+        assert part in text
+    assert "No training showed it" not in str(replace(trained, dataset=BOMB).card())
+    assert "Its model is small" not in str(checkpoint(trained_batches=7).card())
+
+
+def test_the_method_and_bomb_are_cited_as_the_citation_file_says() -> None:
+    cited = yaml.safe_load((Path(__file__).parents[2] / "CITATION.cff").read_text())
+    text = str(checkpoint().card())
+    assert f"title = {{{{{cited['title']}}}}}" in text
+    assert cited["authors"][0]["name"].replace("_", "\\_") in text
+    assert f"version = {{{cited['version']}}}" in text
 
 
 def test_the_hub_in_use_judges_the_metadata(online: LoopbackHub) -> None:

@@ -33,6 +33,7 @@ from lerobot_bomb.bomb.board import task_id
 from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.commands.main import main
+from lerobot_bomb.hub.rates import FIGURE
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
@@ -75,7 +76,7 @@ def test_one_commit_holds_all_that_is_needed_and_nothing_of_this_machine(
     assert len(repository.messages) == 1
     assert repository.is_private
     files = repository.files()
-    assert {Path(name).suffix for name in files} == {".json", ".safetensors", ".md"}
+    assert {Path(name).suffix for name in files} == {".json", ".safetensors", ".md", ".png"}
     assert not any(b"/data/" in content or TOKEN.encode() in content for content in files.values())
     assert TOKEN not in "".join(capsys.readouterr())
     card = files["README.md"].decode()
@@ -92,6 +93,20 @@ def test_one_commit_holds_all_that_is_needed_and_nothing_of_this_machine(
     ours, theirs = (Vla0SmolPolicy.from_pretrained(folder) for folder in (checkpoint, pulled))
     batch = make_batch(make_policy(), 2)
     assert torch.equal(ours.predict_action_chunk(batch), theirs.predict_action_chunk(batch))
+
+
+def test_the_figure_of_an_older_push_goes_with_its_rates(
+    online: LoopbackHub, checkpoint: Path, tmp_path: Path
+) -> None:
+    results = tmp_path / "results.jsonl"
+    results.write_text(result(1000, is_success=True))
+    assert push(checkpoint, "--results", str(results)) == 0
+    files = online.model(REPO_ID).files()
+    assert files[FIGURE].startswith(b"\x89PNG")
+    assert f"]({FIGURE})" in files["README.md"].decode()
+    assert push(checkpoint) == 0
+    files = online.model(REPO_ID).files()
+    assert FIGURE not in files and FIGURE not in files["README.md"].decode()
 
 
 def test_a_dry_run_prints_the_card_and_the_files_and_asks_nobody(

@@ -9,8 +9,11 @@ import yaml
 from hub.dataset_damage import DATASET_DAMAGES
 from hub.server import TOKEN, LoopbackHub
 from lerobot_bomb.commands.main import main
+from lerobot_bomb.data.facts import DatasetFacts
+from lerobot_bomb.hub.dataset import dataset_card
 
 REPO_ID = "me/d"
+COUNTS = {"total_episodes": 3, "total_frames": 60, "fps": 10}
 
 
 @pytest.fixture(scope="module")
@@ -61,11 +64,29 @@ def test_one_commit_tagged_for_lerobot_with_a_card(
         "seeds 7..8",
         "--env.type=bomb",
         f"--dataset.repo_id={REPO_ID}",
+        "license: apache-2.0",
+        "@misc{lerobot_bomb,",
+        "the scripted expert's successes alone were kept",
     ):
         assert part in card
     assert str(tmp_path) not in card
     assert push(root) == 0  # again: the tag moves on
     assert repository.refs["v3.0"] == repository.refs["main"]
+
+
+def test_the_card_of_converted_data_claims_no_licence_and_names_its_source() -> None:
+    info = {
+        **COUNTS,
+        "codebase_version": "v3.0",
+        "features": {"action": {"dtype": "float32", "shape": [4], "names": None}},
+    }
+    converted = dataset_card("me/d", DatasetFacts(info, {"conversion": {"source": "pusht-zarr <b>0123"}}))
+    assert "license" not in converted.split("---\n")[1]
+    assert "its source holds (pusht-zarr &lt;b&gt;0123)" in converted
+    assert "the authors of the demonstrations" in converted
+    assert "--env.type=pusht" in converted
+    others = dataset_card("me/d", DatasetFacts(info, {"conversion": {"source": "other"}}))
+    assert "lerobot-eval" not in others  # its environment is not known
 
 
 def test_nothing_of_a_longer_recording_is_left(

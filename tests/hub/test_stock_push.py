@@ -18,7 +18,7 @@ from lerobot.policies import make_pre_post_processors
 from vla0_smol_cases import STATS, make_policy
 
 from hub.damage import LOCAL
-from hub.server import TOKEN, LoopbackHub
+from hub.server import TOKEN, LoopbackHub, Repository
 
 REPO_ID = "me/x"
 Files = dict[str, bytes]
@@ -102,6 +102,16 @@ def test_a_push_is_one_commit_without_paths_of_this_machine(online: LoopbackHub,
         assert files[path.name] == path.read_bytes()
     for content in files.values():
         assert not any(private in content for private in (str(tmp_path).encode(), b"/data/"))
+
+
+def test_the_hub_is_asked_whether_it_has_the_dataset(online: LoopbackHub, tmp_path: Path) -> None:
+    Training.ended(tmp_path / "first", 1.0).push()
+    card = online.model(REPO_ID).files()["README.md"].decode()
+    assert "datasets:" not in card and "--dataset.repo_id=me/d" not in card
+    online.repositories.setdefault("datasets/me/d", Repository()).commit({"meta/info.json": b"{}"}, "data")
+    Training.ended(tmp_path / "second", 1.0).push()
+    card = online.model(REPO_ID).files()["README.md"].decode()
+    assert "datasets:\n- me/d\n" in card and "--dataset.repo_id=me/d" in card
 
 
 @pytest.mark.long

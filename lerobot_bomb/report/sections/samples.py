@@ -1,5 +1,8 @@
 """Failures to look at."""
 
+import base64
+from html import escape
+
 from lerobot_bomb.report.report import Report, Sample
 from lerobot_bomb.report.table import Cell, Section, Table
 from lerobot_bomb.results.record import NO_VALUE
@@ -9,14 +12,51 @@ NOTE = (
     "A random sample of each class. 'replay' writes a video and a recording for Rerun; add the flags "
     "--policy.NAME=VALUE of the evaluation, if it had any. 'explain' shows what its actions depend on."
 )
+LEGEND = (
+    "Each filmstrip is an episode that was run again: its start, its first grasp (or contact, or middle), "
+    "its end. Pink rings are the targets; r0 to r4 and c0 to c4 number rows and columns."
+)
+MAX_NAME = 100  # characters of a group's name in a heading
 
 
 def section(report: Report) -> Section:
-    """Write the section: a table for each group with failures."""
+    """Write the section: filmstrips by class, if there are any, and a table for each group with failures."""
     by_group: dict[str, list[Sample]] = {}
     for sample in report.samples:
         by_group.setdefault(sample.group, []).append(sample)
-    return Section(TITLE, [_table(name, samples) for name, samples in by_group.items()])
+    tables = [_table(name, samples) for name, samples in by_group.items()]
+    return Section(TITLE, tables, figures=_films(by_group))
+
+
+def _films(by_group: dict[str, list[Sample]]) -> str:
+    """Return HTML: the filmstrips of each group and class; '' if there are none."""
+    parts = []
+    for name, samples in by_group.items():
+        by_class: dict[str, list[Sample]] = {}
+        for sample in samples:
+            if sample.film is not None:
+                by_class.setdefault(str(sample.record.failure), []).append(sample)
+        shown = name if len(name) <= MAX_NAME else f"{name[: MAX_NAME - 1]}…"
+        for failure, filmed in by_class.items():
+            heading = f'<h3 title="{escape(name)}">{escape(shown)}: {escape(failure)}</h3>'
+            parts += [heading, *map(_film, filmed)]
+    return "\n".join([f'<p class="note">{escape(LEGEND)}</p>', *parts]) if parts else ""
+
+
+def _film(sample: Sample) -> str:
+    """Return HTML: a filmstrip, what it shows in words, and the commands that show more."""
+    assert sample.film is not None
+    spec, record = sample.record.spec, sample.record
+    words = [getattr(record, "instruction", ""), f"{record.failure}, {spec.perturbations}, seed {spec.seed}"]
+    words += [sample.note] if sample.note else []
+    told = ". ".join(word.rstrip(".") for word in words if word)
+    source = f"data:image/jpeg;base64,{base64.b64encode(sample.film).decode()}"
+    commands = "\n".join(filter(None, (sample.command, sample.explanation)))
+    return (
+        f'<figure><img src="{source}" alt="Filmstrip: {escape(told)}" loading="lazy" '
+        f'style="max-width:100%;image-rendering:auto"><figcaption>{escape(told)}</figcaption>'
+        f"<pre>{escape(commands)}</pre></figure>"
+    )
 
 
 def _table(name: str, samples: list[Sample]) -> Table:
