@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Sequence
 
-MAX_CHARACTERS = 41  # of a name in a table
+MAX_NAME = 36  # characters of a name in a table or chart
 
 
 def printable(text: str) -> str:
@@ -10,12 +10,12 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
-def shortened(text: str) -> str:
-    """Cut the middle of a text of more than `MAX_CHARACTERS`."""
-    if len(text) <= MAX_CHARACTERS:
-        return text
-    half = (MAX_CHARACTERS - 3) // 2
-    return f"{text[:half]}...{text[-half:]}"
+def shorten(name: str, most: int = MAX_NAME) -> str:
+    """Return a name of at most so many characters, without its middle if it is longer."""
+    if len(name) <= most:
+        return name
+    last = (most - 1) // 2
+    return f"{name[: most - 1 - last]}…{name[-last:]}"
 
 
 def print_lines(*lines: str) -> None:

@@ -2,7 +2,7 @@
 
 import re
 
-from lerobot_bomb.report.chart import INK, MAX_NAME, Chart, chart_text, shorten
+from lerobot_bomb.report.chart import INK, Chart, chart_text
 from lerobot_bomb.report.dots import Block, Dot, DotColumn, dot_chart
 from lerobot_bomb.report.page import MAX_ROWS, MAX_UNBROKEN, render
 from lerobot_bomb.report.table import Cell, Section, Statement, Table

@@ -25,7 +25,7 @@ from lerobot_bomb.results.groups import (
 )
 from lerobot_bomb.results.summary import describe_unpaired, pair_lines, summarise
 from lerobot_bomb.stats import format_p
-from lerobot_bomb.tables import print_lines, print_table, shortened
+from lerobot_bomb.tables import print_lines, print_table, shorten
 
 LEGEND = (
     "success: with 95 % Wilson interval, clustered by seed; change: points, with 95 % interval, from the",
@@ -91,7 +91,7 @@ def _print_rates(told: list[FileGroups]) -> None:
     rows = [
         [
             *([str(each.path)] if several else []),
-            *(shortened(group.policy), suite_of(group), *(_setting(group, name) for name in apart)),
+            *(shorten(group.policy), suite_of(group), *(_setting(group, name) for name in apart)),
             *cells,
         ]
         for each in told
@@ -130,7 +130,7 @@ def _notes(told: list[FileGroups]) -> Iterator[str]:
             yield f"{each.path}: episodes that differ in {', '.join(apart)} are neither pooled nor paired"
         for group in each.groups:
             if unpaired := describe_unpaired(group, each.groups):
-                yield f"{each.path}: {shortened(group.name)}: {unpaired}"
+                yield f"{each.path}: {shorten(group.name)}: {unpaired}"
 
 
 def _print_details(told: FileGroups) -> None:

@@ -10,7 +10,7 @@ from lerobot_bomb.report.report import Sample
 from lerobot_bomb.results.bomb import put_down
 from lerobot_bomb.results.groups import Group, by_condition, suite_of
 from lerobot_bomb.results.record import Record
-from lerobot_bomb.tables import print_table, shortened
+from lerobot_bomb.tables import print_table, shorten
 
 type Files = Mapping[Path, tuple[Mapping[int, Record], list[Group]]]  # {path: ({line: record}, groups)}
 
@@ -40,7 +40,7 @@ class _Failure:
         return {
             "line": str(self.sample.line),
             "seed": str(spec.seed),
-            "policy": shortened(self.group.policy),
+            "policy": shorten(self.group.policy),
             "suite": suite_of(self.group),
             "condition": spec.perturbations,
             "failure": str(self.record.failure),

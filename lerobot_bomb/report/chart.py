@@ -8,7 +8,7 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from lerobot_bomb.report.table import Table
-from lerobot_bomb.tables import printable
+from lerobot_bomb.tables import printable, shorten
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,7 +20,6 @@ COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#99
 MARKERS = "osD^vPX"
 MAX_SERIES = 6  # that a chart can show side by side
 MAX_BARS = 80  # below each other
-MAX_NAME = 36  # characters of a name in a chart
 WIDTH = 9.6  # inches: what a page shows without scrolling
 STYLE = {
     "svg.fonttype": "none",
@@ -79,14 +78,6 @@ def _inline(svg: str, title: str, size: tuple[float, float]) -> str:
         f'<svg role="img" viewBox="0 0 {width:g} {height:g}" '
         f'style="width:{pixels}px;min-width:min(46rem,{pixels}px)"><title>{escape(title)}</title>{body}'
     )
-
-
-def shorten(name: str, most: int = MAX_NAME) -> str:
-    """Return a name of at most so many characters, without its middle if it is longer."""
-    if len(name) <= most:
-        return name
-    last = (most - 1) // 2
-    return f"{name[: most - 1 - last]}…{name[-last:]}"
 
 
 def chart_text(name: str) -> str:

@@ -20,7 +20,7 @@ from lerobot_bomb.results.groups import (
 from lerobot_bomb.results.pairs import PairedComparison, describe_test
 from lerobot_bomb.results.record import describe_numbers
 from lerobot_bomb.stats import SIGNIFICANT, Rate
-from lerobot_bomb.tables import printable, shortened
+from lerobot_bomb.tables import printable, shorten
 
 SPECIAL = {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
@@ -52,7 +52,7 @@ def comparison_table(comparisons: Comparisons) -> str:
     """Write a `table` of two policies on the same episodes; the better in bold."""
     conditions = comparisons.conditions
     groups = groups_of(record for each in conditions for pair in each.pairs for record in pair)
-    a, b = (_escaped(shortened(name)) for name in comparisons.names)
+    a, b = (_escaped(shorten(name)) for name in comparisons.names)
     caption = (
         f"{_where(groups, f' of {a} (A) and {b} (B)')}. B $-$ A: in points, on the same episodes, with "
         rf"Newcombe's 95 \% interval for pairs; $p$: {_escaped(describe_test(len(conditions)))}. "
@@ -175,7 +175,7 @@ def _below(
 
 
 def _name(series: Series) -> str:
-    return _escaped(shortened(series.policy))
+    return _escaped(shorten(series.policy))
 
 
 def _cells(series: Series, condition: str, best: set[tuple[str, str]], number: int) -> list[str]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from html import escape
 
-from lerobot_bomb.report.chart import Chart, shorten
+from lerobot_bomb.report.chart import Chart
 from lerobot_bomb.report.table import Cell, Section, Statement, Table
 
 # one hue in different strengths, which reads the same for the colour-blind

@@ -4,13 +4,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations
 
 from lerobot_bomb.conditions import NONE, AxisCondition
-from lerobot_bomb.report.chart import shorten
 from lerobot_bomb.report.panels import Panel, Series
 from lerobot_bomb.report.table import Statement
-from lerobot_bomb.results.comparison import Comparisons
+from lerobot_bomb.results.comparison import Comparisons, describe_verdict
 from lerobot_bomb.results.groups import rate_of, settings_of
 from lerobot_bomb.results.pairs import PairedComparison
 from lerobot_bomb.stats import SIGNIFICANT, Rate, format_p
+from lerobot_bomb.tables import shorten
 
 MAX_NAMED = 3  # names in a sentence
 MAX_PLACES = 6  # of a ranking
@@ -193,10 +193,10 @@ def describe_comparison(first: Series, second: Series, compared: Comparisons) ->
     nominal = [each for each in found if each.pairs[0][0].spec.perturbations == NONE]
     others = [each for each in found if each.pairs[0][0].spec.perturbations != NONE]
     names = shorten(first.policy), shorten(second.policy)
-    parts = [_verdict("unperturbed", each, *names) for each in nominal]
+    parts = [f"unperturbed, {describe_verdict(each, *names)}." for each in nominal]
     if len(others) == 1:
         under = f"{'U' if parts else 'u'}nder {others[0].pairs[0][0].spec.perturbations}"
-        parts.append(_verdict(under, others[0], *names))
+        parts.append(f"{under}, {describe_verdict(others[0], *names)}.")
     elif others:
         parts.append(_perturbed_verdict(others, *names))
     return Statement(f"{names[0]} against {names[1]}:", " ".join(parts) or "no episode of both.")
@@ -204,21 +204,6 @@ def describe_comparison(first: Series, second: Series, compared: Comparisons) ->
 
 def _is_of(compared: PairedComparison, series: Series) -> bool:
     return settings_of(compared.pairs[0][0]) == series.group.settings
-
-
-def _verdict(where: str, compared: PairedComparison, first: str, second: str) -> str:
-    """Return 'unperturbed, act is better by 28 points [12, 43] (40 pairs, p = 0.0068).'."""
-    counts, number = compared.counts, f"{compared.counts.n} pairs"
-    if counts.difference == 0:
-        return f"{where}, they tie ({counts.first} successes each in {number})."
-    low, high = compared.interval
-    better, low, high = (first, -high, -low) if counts.difference < 0 else (second, low, high)
-    points = f"{100 * abs(counts.difference):.0f} points [{100 * low:.0f}, {100 * high:.0f}]"
-    if compared.p_value < SIGNIFICANT:
-        return f"{where}, {better} is better by {points} ({number}, {format_p(compared.p_value)})."
-    needed = f"; about {compared.num_needed:,} pairs would show it" if compared.num_needed else ""
-    test = f"{number}, {format_p(compared.p_value)}"
-    return f"{where}, no difference is shown: {better} has {points} more ({test}{needed})."
 
 
 def _perturbed_verdict(found: Sequence[PairedComparison], first: str, second: str) -> str:

@@ -28,13 +28,13 @@ class Comparisons:
         return min(each.interval[0] for each in self.conditions)
 
     def verdicts(self) -> list[str]:
-        """Say under which conditions the second policy is better or worse."""
+        """Say under which conditions which policy is better."""
         if len(self.conditions) == 1:
             return [describe_verdict(self.conditions[0])]
         signs = [each.counts.difference > 0 for each in self.conditions if each.is_shown]
         number, num_better = len(self.conditions), sum(signs)
         parts = [f"B is better under {num_better}"] if num_better else []
-        parts += [f"B is worse under {len(signs) - num_better}"] if num_better < len(signs) else []
+        parts += [f"A is better under {len(signs) - num_better}"] if num_better < len(signs) else []
         parts += [f"no difference is shown under {number - len(signs)}"] if len(signs) < number else []
         lines = [f"{each.condition}: {describe_verdict(each)}" for each in self.conditions]
         return [f"of {number} conditions: {', '.join(parts)}", *(f"  {line}" for line in lines)]
@@ -57,19 +57,20 @@ class Comparisons:
         return [*lines, notes]
 
 
-def describe_verdict(compared: PairedComparison) -> str:
-    """Say whether the second policy is better, if the test shows it: 'B is better: +25.0 points ...'."""
-    p_value, n = format_p(compared.p_value), compared.counts.n
-    pairs = f"{n} pair{'s' * (n != 1)}"
+def describe_verdict(compared: PairedComparison, first: str = "A", second: str = "B") -> str:
+    """Return 'B is better by 28 points [12, 43] (40 pairs, p = 0.0068)', or that no difference is shown."""
+    counts = compared.counts
+    pairs = f"{counts.n} pair{'s' * (counts.n != 1)}"
+    if counts.difference == 0:
+        return f"they tie ({counts.first} successes each in {pairs})"
+    low, high = compared.interval
+    better, low, high = (first, -high, -low) if counts.difference < 0 else (second, low, high)
+    points = f"{100 * abs(counts.difference):.0f} points [{100 * low:.0f}, {100 * high:.0f}]"
+    test = f"{pairs}, {format_p(compared.p_value)}"
     if compared.is_shown:
-        word = "better" if compared.counts.difference > 0 else "worse"
-        return f"B is {word}: {compared.describe_difference(' points')}, {p_value}, {pairs}"
-    if compared.counts.difference == 0:
-        return f"no difference is shown in {pairs}"
-    points = f"{100 * compared.counts.difference:+.1f} points"
-    needed = compared.num_needed
-    more = f"; {needed} pairs would show one of this size" if needed else ""
-    return f"no difference is shown in {pairs} ({points}, {p_value}){more}"
+        return f"{better} is better by {points} ({test})"
+    needed = f"; about {compared.num_needed:,} pairs would show this much" if compared.num_needed else ""
+    return f"no difference is shown: {better} has {points} more ({test}{needed})"
 
 
 def _num_pairs(compared: PairedComparison) -> str:

@@ -6,6 +6,7 @@ from html import escape
 from lerobot_bomb.report.report import Report, Sample
 from lerobot_bomb.report.table import Cell, Section, Table
 from lerobot_bomb.results.record import NO_VALUE
+from lerobot_bomb.tables import shorten
 
 TITLE = "Failures to look at"
 NOTE = (
@@ -36,9 +37,8 @@ def _films(by_group: dict[str, list[Sample]]) -> str:
         for sample in samples:
             if sample.film is not None:
                 by_class.setdefault(str(sample.record.failure), []).append(sample)
-        shown = name if len(name) <= MAX_NAME else f"{name[: MAX_NAME - 1]}…"
         for failure, filmed in by_class.items():
-            heading = f'<h3 title="{escape(name)}">{escape(shown)}: {escape(failure)}</h3>'
+            heading = f'<h3 title="{escape(name)}">{escape(shorten(name, MAX_NAME))}: {escape(failure)}</h3>'
             parts += [heading, *map(_film, filmed)]
     return "\n".join([f'<p class="note">{escape(LEGEND)}</p>', *parts]) if parts else ""
 
