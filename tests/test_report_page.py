@@ -6,6 +6,7 @@ from lerobot_bomb.report.chart import INK, Chart, chart_text
 from lerobot_bomb.report.dots import Block, Dot, DotColumn, dot_chart
 from lerobot_bomb.report.page import MAX_ROWS, MAX_UNBROKEN, render
 from lerobot_bomb.report.table import Cell, Section, Statement, Table
+from lerobot_bomb.tables import MAX_NAME, shorten
 
 HOSTILE = "</svg><script>$x$ \n&amp;" + "n" * 5000
 

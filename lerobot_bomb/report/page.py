@@ -5,6 +5,7 @@ from html import escape
 
 from lerobot_bomb.report.chart import Chart
 from lerobot_bomb.report.table import Cell, Section, Statement, Table
+from lerobot_bomb.tables import shorten
 
 # one hue in different strengths, which reads the same for the colour-blind
 SHADE = "background:rgba(0,114,178,{:.2f})"

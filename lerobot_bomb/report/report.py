@@ -65,7 +65,7 @@ class Report:
         pair = first, second
         if pair not in self._compared:
             try:
-                found = compare(*(self.policies[name].records for name in pair))
+                found = compare(self.policies[first].records, self.policies[second].records)
             except ValueError:  # no episode in common
                 found = None
             self._compared[pair] = found
