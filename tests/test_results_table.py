@@ -121,7 +121,7 @@ def test_what_a_name_of_5000_characters_leaves_of_the_table(path: Path, capsys: 
     path.write_text("".join(row(0, policy=name) for name in names))
     table = said(capsys, path)[:3]
     assert max(map(len, table)) < 110
-    assert [line.split()[0] for line in table[1:]] == [f"{kind * 19}...{kind * 19}" for kind in "xy"]
+    assert [line.split()[0] for line in table[1:]] == [f"{kind * 18}…{kind * 17}" for kind in "xy"]
 
 
 def test_without_a_perturbation_there_is_no_change(path: Path, capsys: Printed) -> None:

@@ -247,6 +247,6 @@ def _warn_of_test_seeds(recording: Recording) -> None:
     if seeds[0] <= TEST_SEEDS[-1] and seeds[-1] >= TEST_SEEDS[0]:
         print(
             f"the seeds {seeds[0]}..{seeds[-1]} have episodes that evaluations run, {TEST_SEEDS[0]} to "
-            f"{TEST_SEEDS[-1]}: for training begin at --seed=10000",
+            f"{TEST_SEEDS[-1]}: for training begin at --seed=200000",
             file=sys.stderr,
         )
