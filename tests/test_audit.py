@@ -84,7 +84,7 @@ def test_what_was_planted_is_told_and_nothing_else(
 def test_what_these_episodes_do_not_show_is_left_open(arms: dict[str, Records]) -> None:
     found = answers(arms | {OTHER_INSTRUCTION: records(34, 0.1), RANDOM: records(35, 0.7)}, None)
     assert [question for question, answer in found.items() if answer == OPEN] == [
-        "reads the instruction", "better than random actions", "no episode of the training is evaluated",
+        "reads the instruction", "better than random actions", "evaluates only episodes outside the training",
     ]  # fmt: skip
 
 

@@ -174,7 +174,7 @@ def test_other_instructions_differ_in_one_word_and_name_their_intersection() -> 
 def test_every_path_has_a_look_of_its_own_and_the_numbers_are_in_a_table() -> None:
     ended = cast("Any", SimpleNamespace(is_success=False, failure="dropped"))
     runs = {
-        f"mask {number}": EpisodeRun(ended, np.full((3, 3), 0.01 * number), np.full((3, 3), 0.02), {})
+        f"mask {number}": EpisodeRun(ended, np.full((3, 3), 0.01 * number), np.full((3, 3), 0.02), None)
         for number in range(20)
     }
     chart = paths_chart("Paths", runs, (0.0, 0.045))

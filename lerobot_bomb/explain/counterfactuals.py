@@ -57,7 +57,7 @@ def run_counterfactuals(
     if result.is_success:
         return []
     return [
-        Counterfactual(without, condition, run_under(viewed(condition), loaded, Mask()))
+        Counterfactual(without, condition, run_under(viewed(condition), loaded, Mask(), with_film=True))
         for without, condition in conditions_without(result.levels)
     ]
 

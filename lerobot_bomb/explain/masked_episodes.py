@@ -11,7 +11,7 @@ import torch
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_bomb.envs.rollout import run_episode
-from lerobot_bomb.explain.film import EpisodeRun, Film
+from lerobot_bomb.explain.film import EpisodeCollector, EpisodeRun
 from lerobot_bomb.explain.images import filling, occluded
 from lerobot_bomb.explain.other_policies import scored
 from lerobot_bomb.explain.scored_policy import Batch
@@ -92,11 +92,11 @@ def run_masked(viewed: Viewed, loaded: LoadedPolicy, masks: Mapping[str, Mask]) 
     return {name: run_under(viewed, loaded, mask) for name, mask in masks.items()}
 
 
-def run_under(viewed: Viewed, loaded: LoadedPolicy, mask: Mask) -> EpisodeRun:
+def run_under(viewed: Viewed, loaded: LoadedPolicy, mask: Mask, with_film: bool = False) -> EpisodeRun:
     """Run an episode under a mask."""
     loaded.begin()
-    film = Film()
     with closing(viewed.make_env()) as env:
+        collector = EpisodeCollector(viewed, env, with_film)
 
         def act(observation: dict[str, Any], instruction: str) -> np.ndarray:
             batch = mask.change(loaded.observe([observation], [instruction]), env)
@@ -105,5 +105,5 @@ def run_under(viewed: Viewed, loaded: LoadedPolicy, mask: Mask) -> EpisodeRun:
             return loaded.act(prepared)[0]
 
         for moment in run_episode(env, viewed.spec, act):
-            film.add(moment, env)
-        return film.end(env)
+            collector.add(moment)
+        return collector.end()

@@ -14,7 +14,7 @@ from lerobot_bomb.bomb.expert import current_goal
 from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.envs.rollout import Moment, run_episode
-from lerobot_bomb.explain.film import EpisodeRun, Film
+from lerobot_bomb.explain.film import EpisodeCollector, EpisodeRun
 from lerobot_bomb.explain.phases import PHASES, gripper_does, phases_of
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 from lerobot_bomb.viewing.episode import Viewed
@@ -56,12 +56,12 @@ def take_snapshots(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Snapshot]
         def act(observation: dict[str, Any], instruction: str) -> np.ndarray:
             return loaded.agent([observation], [instruction])[0]
 
-        film, taken = Film(), []
+        collector, taken = EpisodeCollector(viewed, env, with_film=True), []
         for moment in run_episode(env, viewed.spec, act):
-            film.add(moment, env)
+            collector.add(moment)
             if moment.action is not None:
                 taken.append(_snapshot(moment, env))
-        run = film.end(env)
+        run = collector.end()
     if taken[0].state is None:
         return taken, run
     states = [each.state for each in taken if each.state is not None]

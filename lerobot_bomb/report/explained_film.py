@@ -4,16 +4,14 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.observation import WORKSPACE_HIGH_M, WORKSPACE_LOW_M
 from lerobot_bomb.explain.counterfactuals import Counterfactual
-from lerobot_bomb.explain.film import EpisodeRun, Frame
-from lerobot_bomb.explain.maps import data_url
-from lerobot_bomb.explain.pointing import BLACK, FONT, MARKED_PX, OUTLINE_PX, PLACE_RGB, WHITE, Mark, marked
+from lerobot_bomb.explain.film import EpisodeRun
 from lerobot_bomb.report.chart import COLORS, INK, Chart, chart_text, draw
+from lerobot_bomb.report.page import film_figure
 from lerobot_bomb.report.table import Cell, Table
 
 if TYPE_CHECKING:
@@ -22,52 +20,20 @@ if TYPE_CHECKING:
 
 SIZE_INCHES = (7.6, 4.4)
 LABEL_M = 0.022  # of the numbers beside the board, beyond its outer lines
-LABEL_SCALE = 0.6
 DASHES = ("-", "--", ":", "-.")
-SHOWN = "width:min(14rem,40vw)"  # of a picture: two beside each other on a phone
 END_COLOR = COLORS[5]
 
 
 def film_html(name: str, run: EpisodeRun) -> str:
-    """Return the pictures of an episode's start, grasp and end, with what became of it."""
-    pictures = "".join(
-        f'<figure style="margin:0;{SHOWN}"><img src="{data_url(frame_picture(frame))}" '
-        f'style="width:100%" alt="{escape(f"{name}, {what}")}">'
-        f"<div>{escape(what)}, step {frame.step}</div></figure>"
-        for what, frame in run.frames.items()
-    )
-    heading = f"<h3>{escape(name)}: {escape(ending(run))}</h3>"
-    return f'{heading}<div style="display:flex;flex-wrap:wrap;gap:.6rem">{pictures}</div>'
+    """Return the filmstrip of an episode, with what became of it; without a filmstrip, the words alone."""
+    told = f"{name}: {ending(run)}"
+    return f"<p>{escape(told)}</p>" if run.film is None else film_figure(run.film, told)
 
 
 def ending(run: EpisodeRun) -> str:
     """Return how an episode ended, in two words."""
     result = run.result
     return "success" if result.is_success else f"failed, {result.failure}"
-
-
-def frame_picture(frame: Frame) -> np.ndarray:
-    """(MARKED_PX, MARKED_PX, 3) uint8: a picture with its target in a ring, rows and columns numbered."""
-    if frame.camera is None or frame.target_xyz is None:
-        return cv2.resize(frame.image, (MARKED_PX, MARKED_PX), interpolation=cv2.INTER_NEAREST)
-    shown = marked(frame.image, frame.camera, [Mark(frame.target_xyz, PLACE_RGB, True, "target")])
-    scale = MARKED_PX / frame.image.shape[0]
-    for text, xyz in _numbers():
-        x, y = (frame.camera.pixel_of(xyz) * scale).round().astype(int).tolist()
-        for color, width in ((BLACK, OUTLINE_PX), (WHITE, 1)):
-            cv2.putText(shown, text, (x - 6, y + 6), FONT, LABEL_SCALE, color, width, cv2.LINE_AA)
-    return shown
-
-
-def _numbers() -> list[tuple[str, np.ndarray]]:
-    """Return the numbers of rows, at the board's left, and of columns, at its near edge, in metres."""
-    found = []
-    last = BOARD.num_lines - 1
-    for line in range(BOARD.num_lines):
-        row, column = BOARD.intersection_xy(line, 0), BOARD.intersection_xy(last, line)
-        found.append((str(line), np.array([row[0] - LABEL_M, row[1], BOARD.thickness_m])))
-        found.append((str(line), np.array([column[0], column[1] - LABEL_M, BOARD.thickness_m])))
-    return found
 
 
 def counterfactual_html(run: EpisodeRun, settled: Counterfactual | None) -> str:
@@ -107,8 +73,10 @@ def _paint_board(axes: "Axes", target_xy: Sequence[float] | None) -> None:
         for start, end in (((line, 0), (line, last)), ((0, line), (last, line))):
             ends = np.array([BOARD.intersection_xy(*each) for each in (start, end)])
             axes.plot(*ends.T, color=INK, alpha=0.3, linewidth=0.8)
-    for text, xyz in _numbers():
-        axes.text(xyz[0], xyz[1], text, ha="center", va="center", alpha=0.8)
+    for line in range(BOARD.num_lines):
+        row, column = BOARD.intersection_xy(line, 0), BOARD.intersection_xy(last, line)
+        for x, y in ((row[0] - LABEL_M, row[1]), (column[0], column[1] - LABEL_M)):
+            axes.text(x, y, str(line), ha="center", va="center", alpha=0.8)
     if target_xy is not None:
         style = {"markersize": 14, "markeredgewidth": 2, "markeredgecolor": COLORS[1]}
         axes.plot(*target_xy, marker="o", fillstyle="none", linestyle="none", label="target", **style)

@@ -13,12 +13,12 @@ from lerobot_bomb.explain.maps import STRENGTH, TINT_RGB, data_url, strength, ti
 from lerobot_bomb.explain.moment import OTHER_INSTRUCTION, OTHER_SCENE, WORDS, PatchingResult, camera_name
 from lerobot_bomb.explain.spans import spans_of_words
 from lerobot_bomb.report.chart import INK, Chart, draw
-from lerobot_bomb.report.explained_film import SHOWN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+SHOWN = "width:min(14rem,40vw)"  # of a picture: two beside each other on a phone
 PANEL_INCHES = 1.9
 # of corruptions: rows of the figure
 KINDS = ("hidden patch", "hidden words", "other words", "other scene")

@@ -1,5 +1,6 @@
 """A report as one HTML file: no network, no script, readable on a phone, in light and dark."""
 
+import base64
 from collections.abc import Sequence
 from html import escape
 
@@ -131,3 +132,12 @@ def _cell(cell: Cell, kind: list[str]) -> str:
     )
     names = [*kind, "long"] if len(cell.text) > MAX_UNBROKEN else kind
     return f"<td{_class(names)}{style}>{video}{_shown(cell.text)}</td>"
+
+
+def film_figure(film: bytes, told: str, below: str = "") -> str:
+    """Return a filmstrip, a JPEG, with what it shows in words; `below`: HTML."""
+    source = f"data:image/jpeg;base64,{base64.b64encode(film).decode()}"
+    return (
+        f'<figure><img src="{source}" alt="Filmstrip: {escape(told)}" loading="lazy" '
+        f'style="max-width:100%;image-rendering:auto"><figcaption>{escape(told)}</figcaption>{below}</figure>'
+    )

@@ -119,7 +119,7 @@ def _generalises(train: list[Record], heldout: list[Record]) -> Verdict:
 
 
 def _new_seeds(records: list[Record], trained: Sequence[int] | None) -> Verdict:
-    question = "no episode of the training is evaluated"
+    question = "evaluates only episodes outside the training"
     if trained is None:
         return Verdict(question, OPEN, "the dataset of the training is not here, or does not say its seeds")
     seen = sorted({each.spec.seed for each in records} & set(trained))

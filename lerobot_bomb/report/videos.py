@@ -1,7 +1,6 @@
 """Videos and filmstrips of failures: videos beside the page that shows them, filmstrips in it."""
 
 import hashlib
-import io
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -9,16 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import quote
 
-import numpy as np
-from PIL import Image
-
 from lerobot_bomb.report.report import Sample
 from lerobot_bomb.results.record import Record, different_fields
 from lerobot_bomb.viewing.episode import write_episode_with_film
-from lerobot_bomb.viewing.film import film_of
+from lerobot_bomb.viewing.film import as_jpeg, film_of
 from lerobot_bomb.viewing.replay import Replay
-
-JPEG_QUALITY = 80  # of a filmstrip: a page with 40 of them is still sent as one file
 
 
 def with_pictures(
@@ -55,15 +49,9 @@ def _run(sample: Sample, folder: Path, has_video: bool) -> Sample:
     different = different_fields(record, result)
     note = f"not as recorded: {different[0]} differs" if different else ""
     video = None if path is None else quote(f"{folder.name}/{path.name}")
-    return replace(sample, video=video, film=_jpeg(film), note=note)
+    return replace(sample, video=video, film=as_jpeg(film), note=note)
 
 
 def _file_name(record: Record) -> str:
     digest = hashlib.sha256(json.dumps(record.as_json(), sort_keys=True).encode()).hexdigest()
     return f"{record.failure}-seed{record.spec.seed}-{digest[:8]}.mp4"
-
-
-def _jpeg(film: np.ndarray) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(film).save(file, format="jpeg", quality=JPEG_QUALITY, subsampling=0, optimize=True)
-    return file.getvalue()

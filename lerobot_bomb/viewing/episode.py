@@ -138,7 +138,7 @@ def _write_episodes(
                 results.append(env.get_wrapper_attr("episode_result")())
             log.add_result(results[-1])
             if film is not None:
-                films.append(draw_film(film, run, results[-1]))
+                films.append(draw_film(film, run.viewed, results[-1]))
         _write_video(images, fps, unfinished_mp4)
     return results, films
 

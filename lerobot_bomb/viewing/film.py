@@ -1,5 +1,6 @@
 """Filmstrip of an episode: its start, its first contact, and its end, on one image."""
 
+import io
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -11,11 +12,12 @@ from PIL import Image, ImageDraw
 from lerobot_bomb.environments import env_type
 from lerobot_bomb.envs.rollout import Moment, run_episode
 from lerobot_bomb.results.record import Record
-from lerobot_bomb.viewing.episode import EnvView, ViewedRun
+from lerobot_bomb.viewing.episode import EnvView, Viewed, ViewedRun
 from lerobot_bomb.viewing.sheet import Sheet, caption, font
 from lerobot_bomb.viewing.video import packed, unpacked
 
 TILE_SIZE = 260  # pixels
+JPEG_QUALITY = 80  # a page with 40 filmstrips is still sent as one file
 LABEL_WIDTH = 80  # pixels
 MARK_RGB, EDGE_RGB = (255, 255, 255), (0, 0, 0)  # white with a black edge is seen on all that is drawn
 RING_RGB = (255, 0, 190)  # pink: neither board nor stones nor gripper have it, also for the colour-blind
@@ -82,13 +84,20 @@ def film_of(run: ViewedRun) -> tuple[np.ndarray, Record]:
         for moment in run_episode(env, viewed.spec, agent):
             film.add(moment)
         result: Record = env.get_wrapper_attr("episode_result")()
-    return draw_film(film, run, result), result
+    return draw_film(film, viewed, result), result
 
 
-def draw_film(film: Film, run: ViewedRun, result: Record) -> np.ndarray:
-    """Draw the filmstrip of a run that has ended, with condition, seed and outcome in words."""
-    heading = f"{run.viewed.title}: {result.failure or 'success'}"
-    return film.draw(heading, getattr(result, "instruction", ""), run.viewed.log.describe(result))
+def draw_film(film: Film, viewed: Viewed, result: Record) -> np.ndarray:
+    """Draw the filmstrip of an episode that has ended, with condition, seed and outcome in words."""
+    heading = f"{viewed.title}: {result.failure or 'success'}"
+    return film.draw(heading, getattr(result, "instruction", ""), viewed.log.describe(result))
+
+
+def as_jpeg(film: np.ndarray) -> bytes:
+    """Encode a filmstrip, (H, W, 3) uint8."""
+    file = io.BytesIO()
+    Image.fromarray(film).save(file, format="jpeg", quality=JPEG_QUALITY, subsampling=0, optimize=True)
+    return file.getvalue()
 
 
 def drawn(image: np.ndarray, marks: Marks) -> np.ndarray:

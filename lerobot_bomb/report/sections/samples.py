@@ -1,8 +1,8 @@
 """Failures to look at."""
 
-import base64
 from html import escape
 
+from lerobot_bomb.report.page import film_figure
 from lerobot_bomb.report.report import Report, Sample
 from lerobot_bomb.report.table import Cell, Section, Table
 from lerobot_bomb.results.record import NO_VALUE
@@ -50,13 +50,8 @@ def _film(sample: Sample) -> str:
     words = [getattr(record, "instruction", ""), f"{record.failure}, {spec.perturbations}, seed {spec.seed}"]
     words += [sample.note] if sample.note else []
     told = ". ".join(word.rstrip(".") for word in words if word)
-    source = f"data:image/jpeg;base64,{base64.b64encode(sample.film).decode()}"
     commands = "\n".join(filter(None, (sample.command, sample.explanation)))
-    return (
-        f'<figure><img src="{source}" alt="Filmstrip: {escape(told)}" loading="lazy" '
-        f'style="max-width:100%;image-rendering:auto"><figcaption>{escape(told)}</figcaption>'
-        f"<pre>{escape(commands)}</pre></figure>"
-    )
+    return film_figure(sample.film, told, f"<pre>{escape(commands)}</pre>")
 
 
 def _table(name: str, samples: list[Sample]) -> Table:
