@@ -68,7 +68,7 @@ def test_a_policy_that_has_nothing_to_hide_passes(arms: dict[str, Records]) -> N
         ("reads the instruction", {OTHER_INSTRUCTION: records(36)}),
         ("looks at the images", {BLANK: records(36)}),
         ("the same flags give the same episodes", {AGAIN: [*records(36)[:-1], *records(0, 0.1, 1, N - 1)]}),
-        ("the size of the batch does not decide", {ALONE: records(20, 0.01)}),
+        ("the batch size does not change the success rate", {ALONE: records(20, 0.01)}),
         ("every episode can be solved", {EXPERT: records(N - 1)}),
         ("does as well on what is held out", {HELDOUT: records(4)}),
     ],
@@ -107,7 +107,7 @@ def test_tasks_that_share_seeds_are_paired_task_by_task() -> None:
     arms = {POLICY: tasks(0.0), AGAIN: tasks(0.0), ALONE: tasks(0.01)}
     found = {verdict.question: verdict for verdict in judge(arms, None)}
     assert found["the same flags give the same episodes"].evidence == "40 of 40, bit for bit"
-    alone = found["the size of the batch does not decide"]
+    alone = found["the batch size does not change the success rate"]
     assert alone.evidence.startswith("0 of 40 episodes end otherwise (p = 1, not adjusted)")
 
 

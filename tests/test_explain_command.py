@@ -33,8 +33,8 @@ def test_one_episode(policy_type: str, tmp_path: Path, capsys: pytest.CaptureFix
         assert {len(grid) for grid in moment["moved_mm"]["patches"].values()} == {4}
         assert moment["moved_mm"]["objects"].keys() == moment["objects"].keys()
     page = (output / "explanation.html").read_text()
-    # the maps, and the pictures of start, grasp and end
-    assert page.count("<img ") == 2 * len(phases) + 3 and "<script" not in page
+    # the maps, and the filmstrip
+    assert page.count("<img ") == 2 * len(phases) + 1 and "<script" not in page
     assert all(html.escape(sentence) in page for sentence in found["verdict"])
     assert "http" not in page.replace("http://www.w3.org/1999/xlink", "")
     masked = found["masked_episodes"]

@@ -82,7 +82,7 @@ def _same_alone(pairs: list[Pair]) -> Verdict:
         f"{num_equal} are the same bit for bit"
     )
     answer = NO if counts.p_value < SIGNIFICANT else YES
-    return Verdict("the size of the batch does not decide", answer, evidence)
+    return Verdict("the batch size does not change the success rate", answer, evidence)
 
 
 def _depends(question: str, name: str, pairs: list[Pair]) -> Verdict:
