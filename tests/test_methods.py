@@ -88,15 +88,15 @@ def test_what_each_type_says() -> None:
     assert text(relative_actions=True, color_jitter=jitter, **half).methods()[1:] == [
         "chunk of 10, 5 executed",
         "crop to 0.875",
-        "state read",
-        "relative actions",
+        "robot state as input",
+        "actions relative to the state",
         "masking up to 15 % (value)",
         "colour jitter",
     ]
     assert text(mask_skip_prob=1.0, crop_fraction=1.0, use_state=False).methods()[-5:] == [
         "no crop",
-        "no state",
-        "absolute actions",
+        "no robot state",
+        "actions not relative to the state",
         "no masking",
         "no colour jitter",
     ]
@@ -105,7 +105,7 @@ def test_what_each_type_says() -> None:
         "chunk of 4, 1 executed",
         "ensemble of 4 (adaptive)",
         "crop to 0.9",
-        "no state",
+        "no robot state",
         "3-D positions by depth (observation)",
     ]
     assert fdvla(use_denoise_head=False, dualmod_flow=False).methods()[:3] == [

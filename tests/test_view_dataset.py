@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.viewing.recorded import LABEL_WIDTH, TILE_HEIGHT, RecordedDataset
+from lerobot_bomb.viewing.recorded import LABEL_WIDTH, TILE_HEIGHT, ViewedDataset
 from lerobot_bomb.viewing.sheet import GAP, Sheet
 
 NUM_EPISODES, LENGTH, FPS = 4, 5, 10
@@ -110,7 +110,7 @@ def test_a_sheet_shows_the_first_the_middle_and_the_last_frame(root: Path, tmp_p
 
 
 def test_all_frames_are_read_and_those_after_a_gap(root: Path) -> None:
-    dataset = RecordedDataset.read(root)
+    dataset = ViewedDataset.read(root)
     assert dataset.cameras == [WORKSPACE, WRIST]
     assert dataset.task(2) == "Task 2."
     for frames in (range(LENGTH), (1, 4)):

@@ -21,14 +21,14 @@ def view_dataset(args: argparse.Namespace, defaults: dict[str, object], folder: 
             raise ValueError(
                 f"--{name}={getattr(args, name)} is of an episode to be run, not of --dataset; drop it"
             )
-    from lerobot_bomb.viewing.recorded import RecordedDataset, write_sheet, write_video
+    from lerobot_bomb.viewing.recorded import ViewedDataset, write_sheet, write_video
 
     root: Path = args.dataset
     if not root.is_dir():
         raise ValueError(f"--dataset={root}: there is no such folder; give the --root of a recording")
     path = _output(args.output, folder, root)
     check_new([path])
-    dataset = RecordedDataset.read(root)
+    dataset = ViewedDataset.read(root)
     num_episodes = len(dataset.episodes)
     episodes = args.episodes
     if episodes is None:

@@ -58,7 +58,7 @@ def _intersection(place: Sequence[int]) -> str:
     return f"row {row}, column {column}"
 
 
-def outcomes(results: Sequence[Values]) -> str:
+def count_outcomes(results: Sequence[Values]) -> str:
     """Return how often episodes succeeded, and the classes of the others."""
     failures = [each["failure"] for each in results if not each["is_success"]]
     counts = {name: failures.count(name) for name in sorted(set(failures), key=failures.count, reverse=True)}

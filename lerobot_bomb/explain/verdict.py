@@ -20,8 +20,8 @@ from lerobot_bomb.explain.effects import (
 )
 from lerobot_bomb.explain.facts import (
     as_recorded,
+    count_outcomes,
     outcome,
-    outcomes,
     with_masks,
     without_perturbations,
     word_name,
@@ -40,7 +40,7 @@ def verdict(episodes: Sequence[Values]) -> list[str]:
 
 def _endings(episodes: Sequence[Values]) -> Iterator[str]:
     if len(episodes) > 1:
-        yield outcomes([each["result"] for each in episodes])
+        yield count_outcomes([each["result"] for each in episodes])
         return
     (episode,) = episodes
     yield outcome(episode["result"])

@@ -20,7 +20,7 @@ from lerobot_bomb.hub.markdown import code, command, fenced, plain
 from lerobot_bomb.hub.method import BOMB, Method
 from lerobot_bomb.hub.rates import FIGURE, figure, headline, results_table
 from lerobot_bomb.hub.training import peft_flags, train_command
-from lerobot_bomb.hub.usage import in_python, use
+from lerobot_bomb.hub.usage import how_to_use, in_python
 from lerobot_bomb.results.groups import Group, groups_of
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.vlm.tokenizer import NANO
@@ -125,7 +125,7 @@ class Checkpoint:
 
     def _text(self) -> str:
         sections = {
-            "Use": use(self.repo_id, self._eval_flags(), self.adapters_of is not None),
+            "Use": how_to_use(self.repo_id, self._eval_flags(), self.adapters_of is not None),
             "Results": self._results(),
             "What it cannot do": self._limits(),
             "Training": self._training(),

@@ -8,7 +8,7 @@ from huggingface_hub import EvalResult, EvalResultEntry, eval_result_entries_to_
 from huggingface_hub.repocard_data import eval_results_to_model_index
 
 from lerobot_bomb.conditions import AxisCondition
-from lerobot_bomb.hub.rates import suite_of
+from lerobot_bomb.hub.rates import suite_or_task
 from lerobot_bomb.results.groups import Group, by_condition, differing, rate_of
 from lerobot_bomb.results.record import Record
 
@@ -20,7 +20,7 @@ def model_index(groups: list[Group]) -> list[EvalResult]:
     return [
         EvalResult(
             task_type="robotics",
-            task_name=suite_of(records[0]),
+            task_name=suite_or_task(records[0]),
             dataset_type=group.record_type.env_type,
             dataset_name=group.records[0].benchmark(),
             dataset_config=_config(condition, records),  # tells results apart, which their task does not
@@ -57,11 +57,11 @@ def check_one_rate_each(groups: list[Group]) -> None:
     """Raise a ValueError if a policy has two rates for one condition, of episodes that must not be pooled."""
     first: dict[tuple[str, AxisCondition], Group] = {}
     for group, condition, records in _conditions(groups):
-        other = first.setdefault((suite_of(records[0]), condition), group)
+        other = first.setdefault((suite_or_task(records[0]), condition), group)
         if other is not group:
             raise ValueError(
-                f"{records[0].describe_policy()} has two rates for {suite_of(records[0])}, {condition}: the "
-                f"episodes differ in {', '.join(differing([other, group]))}; export the records of one"
+                f"{records[0].describe_policy()} has two rates for {suite_or_task(records[0])}, {condition}: "
+                f"the episodes differ in {', '.join(differing([other, group]))}; export the records of one"
             )
 
 
@@ -73,7 +73,7 @@ def _conditions(groups: list[Group]) -> Iterator[tuple[Group, AxisCondition, lis
 
 def _config(condition: AxisCondition, records: list[Record]) -> str:
     """Return the task and condition as `place.camera-3`."""
-    return f"{suite_of(records[0])}.{condition.key}"
+    return f"{suite_or_task(records[0])}.{condition.key}"
 
 
 def _share(records: list[Record]) -> float:

@@ -121,14 +121,14 @@ def mostly_failing(groups: Sequence[Group]) -> list[str]:
     ]
 
 
-def suite_of(record: Record) -> str:
+def suite_or_task(record: Record) -> str:
     """Return the suite of an episode, or its task where the environment has no suites."""
     return getattr(record.spec, "suite", record.tasks[0])
 
 
 def _title(group: Group) -> str:
     first = group.records[0]
-    return f"{first.benchmark()}, {suite_of(first)}"
+    return f"{first.benchmark()}, {suite_or_task(first)}"
 
 
 def _cut(text: str) -> str:

@@ -7,7 +7,7 @@ from lerobot_bomb.environments import env_type
 from lerobot_bomb.hub.markdown import command, fenced
 
 
-def use(repo_id: str, flags: Sequence[str] | None, is_adapters: bool) -> str:
+def how_to_use(repo_id: str, flags: Sequence[str] | None, is_adapters: bool) -> str:
     """Install, evaluate and see the rate, as Markdown; `flags` of the environment, None: it is unknown."""
     package = "'.[lora]'" if is_adapters else "."
     types = [flag.partition("=")[2] for flag in flags or () if flag.startswith("--env.type=")]

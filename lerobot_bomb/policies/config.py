@@ -211,7 +211,7 @@ class VlaConfig(ChunkConfig):
             *super().methods(),
             *([f"ensemble of {size} ({self.temporal_ensemble_weighting})"] if size else []),
             "no crop" if side == 1 else f"crop to {side:g}",
-            "state read" if self.use_state else "no state",
+            "robot state as input" if self.use_state else "no robot state",
         ]
 
     @property

@@ -24,7 +24,8 @@ class RelativeVlaConfig(VlaConfig):
     relative_state_indices: list[int] | None = None
 
     def methods(self) -> list[str]:
-        return [*super().methods(), "relative actions" if self.relative_actions else "absolute actions"]
+        relation = "relative" if self.relative_actions else "not relative"
+        return [*super().methods(), f"actions {relation} to the state"]
 
     def relative_dims(self) -> dict[int, int]:
         """Return {relative action dimension: its state dimension}.

@@ -28,7 +28,7 @@ MOMENTS = ("first", "middle", "last")
 
 
 @dataclass(frozen=True)
-class RecordedDataset:
+class ViewedDataset:
     """A LeRobotDataset v3 in a folder, of images or videos."""
 
     root: Path
@@ -36,7 +36,7 @@ class RecordedDataset:
     episodes: pa.Table
 
     @classmethod
-    def read(cls, root: Path) -> "RecordedDataset":
+    def read(cls, root: Path) -> "ViewedDataset":
         """Read the metadata.
 
         Raises:
@@ -142,7 +142,7 @@ def _decoded(path: Path, start_s: float, frames: Sequence[int], fps: float) -> I
             last = frame
 
 
-def write_sheet(dataset: RecordedDataset, episodes: Sequence[int], path: Path) -> None:
+def write_sheet(dataset: ViewedDataset, episodes: Sequence[int], path: Path) -> None:
     """Write a PNG: each episode's instruction, and the first, middle and last frame of each camera."""
     rows: dict[str, list[np.ndarray]] = {}
     for episode in episodes:
@@ -163,7 +163,7 @@ def write_sheet(dataset: RecordedDataset, episodes: Sequence[int], path: Path) -
 
 
 def write_video(
-    dataset: RecordedDataset, episodes: Sequence[int], path: Path, progress: Callable[[int], object]
+    dataset: ViewedDataset, episodes: Sequence[int], path: Path, progress: Callable[[int], object]
 ) -> None:
     """Write all frames of the episodes, one after the other, cameras side by side, with their instruction."""
     size: tuple[int, int] | None = None  # of all images of a video

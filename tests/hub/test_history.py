@@ -45,15 +45,15 @@ def rows(history: History) -> list[list[str]]:
     return [line.strip("| ").split(" | ") for line in lines[2:]]
 
 
-def of(num_batches: int, parent: object, steps: int, **options: Any) -> History:
+def history_of(num_batches: int, parent: object, steps: int, **options: Any) -> History:
     return History.of(config(num_batches, parent), train_config(steps, **options), None)
 
 
 def test_one_training_from_the_start() -> None:
     data = ["`me/d`, a name on the machine of the training", "not known", "4", "3", "this checkpoint"]
-    assert rows(of(1000, None, 1000)) == [["1 to 1,000", *data]]
-    assert rows(of(500, None, 1000)) == [["1 to 500", *data]]  # saved before the end
-    assert of(1000, None, 1000).start is None
+    assert rows(history_of(1000, None, 1000)) == [["1 to 1,000", *data]]
+    assert rows(history_of(500, None, 1000)) == [["1 to 500", *data]]  # saved before the end
+    assert history_of(1000, None, 1000).start is None
 
 
 def test_the_shipped_checkpoint_was_trained_before_its_last_training() -> None:
@@ -69,7 +69,7 @@ def test_the_shipped_checkpoint_was_trained_before_its_last_training() -> None:
 def test_a_parent_is_followed_with_its_hash(tmp_path: Path) -> None:
     first = write_parent(tmp_path / "first", 10, 10)
     second = write_parent(tmp_path / "second", 30, 20, parent=first)
-    history = of(100, second, 70)
+    history = history_of(100, second, 70)
     sha256 = hashlib.sha256(b"weights").hexdigest()
     ended = f"a checkpoint without a name on the Hub, SHA-256 `{sha256}`"
     assert [row[0] for row in rows(history)] == ["1 to 10", "11 to 30", "31 to 100"]
@@ -80,7 +80,7 @@ def test_a_parent_is_followed_with_its_hash(tmp_path: Path) -> None:
 
 
 def test_a_shipped_parent_has_its_name() -> None:
-    history = of(30050, shipped_checkpoint("vla0_smol"), 50)
+    history = history_of(30050, shipped_checkpoint("vla0_smol"), 50)
     assert [row[0] for row in rows(history)] == ["1 to 10,000", "10,001 to 30,000", "30,001 to 30,050"]
     assert rows(history)[1][-1] == f"`bomb:vla0_smol`, SHA-256 `{SHIPPED_SHA256}`"
     assert history.start == "bomb:vla0_smol"
@@ -91,24 +91,24 @@ def test_a_shipped_parent_has_its_name() -> None:
     [("me/base", "`me/base`", "me/base"), ("/gone/x", "a checkpoint that is not here", "CHECKPOINT")],
 )
 def test_a_parent_that_is_not_here(parent: str, ended: str, start: str) -> None:
-    history = of(300, parent, 200)
+    history = history_of(300, parent, 200)
     assert [rows(history)[0], rows(history)[1][0]] == [["1 to 100", *NONE_KNOWN, ended], "101 to 300"]
     assert history.start == start
-    cut_short = of(150, parent, 200)  # how many came before is not known
+    cut_short = history_of(150, parent, 200)  # how many came before is not known
     assert [row[0] for row in rows(cut_short)] == ["before", "up to 150"]
 
 
 def test_a_published_copy_that_names_no_parent_may_have_had_one() -> None:
-    history = of(150, None, 200, output_dir=None)
+    history = history_of(150, None, 200, output_dir=None)
     assert [row[0] for row in rows(history)] == ["before", "up to 150"]
     assert history.start == "CHECKPOINT"
 
 
 def test_a_resumed_training_names_itself(tmp_path: Path) -> None:
     itself = write_parent(tmp_path / "last", 200, 200, parent=tmp_path / "last")
-    assert [row[0] for row in rows(of(200, itself, 200))] == ["1 to 200"]
+    assert [row[0] for row in rows(history_of(200, itself, 200))] == ["1 to 200"]
     half = write_parent(tmp_path / "half", 100, 200)
-    assert [row[0] for row in rows(of(200, half, 200))] == ["1 to 100", "101 to 200"]
+    assert [row[0] for row in rows(history_of(200, half, 200))] == ["1 to 100", "101 to 200"]
 
 
 def test_without_the_config_of_the_training_nothing_is_known() -> None:

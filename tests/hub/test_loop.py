@@ -92,7 +92,7 @@ def loop(hub: LoopbackHub, folder: Path, policy_type: str) -> str:
 
 def check_card(card: str, policy_type: str) -> None:
     metadata = yaml.safe_load(card.split("---\n")[1])
-    assert metadata["datasets"] == DATASET
+    assert metadata["datasets"] == [DATASET]
     assert policy_type in metadata["tags"]
     assert "base_model" not in metadata  # nano is none
     for part in (*CARD_PARTS, "--env.control_mode=relative", "--env.image_size=64", "task version 1.0"):
