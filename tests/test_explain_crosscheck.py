@@ -60,6 +60,7 @@ def by_nnsight() -> dict[str, list[list[float]]]:
     return json.loads(printed.splitlines()[-1])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CALLED_ONCE)
 def test_heads_are_what_nnsight_puts_back(name: str, by_nnsight: dict[str, list[list[float]]]) -> None:
     question = ask(loaded(name))

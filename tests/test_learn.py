@@ -64,6 +64,7 @@ def test_a_folder_is_in_use_until_the_commands_of_a_killed_run_have_ended(tmp_pa
         pass
 
 
+@pytest.mark.long
 def test_a_task_is_learnt_by_stock_commands_and_goes_on_where_it_stopped(
     commands: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -90,6 +90,7 @@ def require_same_inputs(both: Routes) -> None:
             assert all(map(torch.equal, calls, actual[name])), f"{name}, frame {int(trained['index'])}"
 
 
+@pytest.mark.one_type
 def test_images_give_exactly_the_same_inputs(routes: MakeRoutes, options: Options) -> None:
     require_same_inputs(routes(options))
 

@@ -90,7 +90,7 @@ def root(recorded: Path, tmp_path: Path) -> Path:
         pytest.param(VIDEO, HALF, id="video"),
         pytest.param(IMAGES, HALF, id="images", marks=pytest.mark.long),
         pytest.param(None, EXPERT, id="static"),
-        pytest.param(RELABELLED, OTHER, id="relabelled"),
+        pytest.param(RELABELLED, OTHER, id="relabelled", marks=pytest.mark.long),
     ],
 )
 def test_joined_parts_are_the_dataset_of_one_process(

@@ -95,7 +95,8 @@ def check_after_kill(root: Path, blocks: dict[str, dict[str, bytes]], reference:
         blocks.update(now)
 
 
-@pytest.mark.parametrize("mode", ["video", pytest.param("images", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("mode", ["video", "images"])
 def test_a_recording_killed_before_each_of_its_steps_loses_nothing(
     mode: str, server: RecorderServer, references: dict[str, Reference], tmp_path: Path
 ) -> None:

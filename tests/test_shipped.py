@@ -116,6 +116,7 @@ def test_the_command_prints_a_folder_or_all(capsys: pytest.CaptureFixture[str]) 
     assert checkpoint_path("some/folder") == "some/folder"
 
 
+@pytest.mark.long
 def test_the_demo_ends_with_rates_and_a_contact_sheet(
     stock_cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -64,6 +64,7 @@ def lines_of(path: Path) -> list[dict[str, Any]]:
     return [line | {"policy": None, "evaluation": None} | dict.fromkeys(MEASURED) for line in lines]
 
 
+@pytest.mark.long
 def test_the_harness_runs_the_episodes_of_lerobot_eval(
     server: CheckpointServer, stock_cli: Callable[..., None], tmp_path: Path
 ) -> None:
