@@ -26,8 +26,8 @@ END_COLOR = COLORS[5]
 
 def film_html(name: str, run: EpisodeRun) -> str:
     """Return the filmstrip of an episode, with what became of it; without a filmstrip, the words alone."""
-    told = f"{name}: {ending(run)}"
-    return f"<p>{escape(told)}</p>" if run.film is None else film_figure(run.film, told)
+    heading = f"<h3>{escape(name)}: {escape(ending(run))}</h3>"
+    return heading if run.film is None else heading + film_figure(run.film, name)
 
 
 def ending(run: EpisodeRun) -> str:

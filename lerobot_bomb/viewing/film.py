@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw
 from lerobot_bomb.environments import env_type
 from lerobot_bomb.envs.rollout import Moment, run_episode
 from lerobot_bomb.results.record import Record
+from lerobot_bomb.tables import shorten
 from lerobot_bomb.viewing.episode import EnvView, Viewed, ViewedRun
 from lerobot_bomb.viewing.sheet import Sheet, caption, font
 from lerobot_bomb.viewing.video import packed, unpacked
@@ -19,6 +20,7 @@ from lerobot_bomb.viewing.video import packed, unpacked
 TILE_SIZE = 260  # pixels
 JPEG_QUALITY = 80  # a page with 40 filmstrips is still sent as one file
 LABEL_WIDTH = 80  # pixels
+MAX_TITLE = 70  # characters
 MARK_RGB, EDGE_RGB = (255, 255, 255), (0, 0, 0)  # white with a black edge is seen on all that is drawn
 RING_RGB = (255, 0, 190)  # pink: neither board nor stones nor gripper have it, also for the colour-blind
 MARK_SIZE, RING_WIDTH = 14, 3  # pixels
@@ -89,7 +91,7 @@ def film_of(run: ViewedRun) -> tuple[np.ndarray, Record]:
 
 def draw_film(film: Film, viewed: Viewed, result: Record) -> np.ndarray:
     """Draw the filmstrip of an episode that has ended, with condition, seed and outcome in words."""
-    heading = f"{viewed.title}: {result.failure or 'success'}"
+    heading = f"{shorten(viewed.title, MAX_TITLE)}: {result.failure or 'success'}"
     return film.draw(heading, getattr(result, "instruction", ""), viewed.log.describe(result))
 
 
