@@ -50,7 +50,7 @@ def render(title: str, sections: Sequence[Section]) -> str:
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(shorten(title, MAX_TEXT))}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        f"{heading}\n<nav>{links}</nav>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
+        f"<header>{heading}</header>\n<nav>{links}</nav>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
     )
 
 
