@@ -301,7 +301,7 @@ def test_failures_are_described_by_class_and_seed() -> None:
     failures = [{"seed": s, "failure": f} for s, f in ((2, "imprecise"), (5, "dropped"), (9, "imprecise"))]
     expected = "3 failed and were left out: 1 dropped (seeds 5); 2 imprecise (seeds 2, 9)"
     assert describe_failures(failures) == expected
-    assert describe_failures([]) == "No episode failed."
+    assert describe_failures([]) == "No episode was left out."
 
 
 def test_a_broken_expert_ends_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -139,7 +139,7 @@ def _check_success_rate(progress: Progress) -> None:
 def describe_failures(failures: list[dict[str, Any]]) -> str:
     """Count the failed episodes in one line, with their classes and seeds."""
     if not failures:
-        return "No episode failed."
+        return "No episode was left out."
     seeds: dict[str, list[str]] = {}
     for failure in failures:
         seeds.setdefault(failure["failure"], []).append(str(failure["seed"]))
