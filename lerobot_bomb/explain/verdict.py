@@ -136,14 +136,14 @@ def _words(effects: Sequence[Effect], seen: Sequence[Effect]) -> Iterator[str]:
     told = _listed([f"{word_name(each.name)} ({each.evidence})" for each in used.values()])
     verb = "decides" if len(used) == 1 and BOTH not in used else "decide"
     unread = [each for each in effects if not each.matters and not each.is_open]
-    rest = f"; no other word does (at most {unread[0].amount})" if unread else ""
+    rest = "; no other word does" if unread else ""
     only = "only " if len(used) == 1 else ""
-    yield f"Of the instruction, {only}{told} {verb}{rest}{_weakly([*used.values()], seen)}."
+    yield f"Of the instruction, {only}{told} {verb}{_weakly([*used.values()], seen)}{rest}."
 
 
 def _weakly(used: Sequence[Effect], seen: Sequence[Effect]) -> str:
     most = max((each.size for each in seen), default=0.0)
-    return " - weakly, beside what it sees" if used[0].size < SHARE * most else ""
+    return ", though weakly beside what it sees" if used[0].size < SHARE * most else ""
 
 
 def _followed(moments: Sequence[Values]) -> Iterator[str]:

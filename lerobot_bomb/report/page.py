@@ -135,9 +135,9 @@ def _cell(cell: Cell, kind: list[str]) -> str:
 
 
 def film_figure(film: bytes, told: str, below: str = "") -> str:
-    """Return a filmstrip, a JPEG, with what it shows in words; `below`: HTML."""
+    """Return a filmstrip, a JPEG; `told`: what it shows, in words; `below`: HTML."""
     source = f"data:image/jpeg;base64,{base64.b64encode(film).decode()}"
     return (
         f'<figure><img src="{source}" alt="Filmstrip: {escape(told)}" loading="lazy" '
-        f'style="max-width:100%;image-rendering:auto"><figcaption>{escape(told)}</figcaption>{below}</figure>'
+        f'style="max-width:100%;image-rendering:auto">{below}</figure>'
     )

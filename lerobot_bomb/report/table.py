@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from lerobot_bomb.report.chart import Chart
 
+MAX_TOLD = 6  # policies that have a sentence
+
 
 @dataclass(frozen=True)
 class Cell:

@@ -7,17 +7,19 @@ from lerobot_bomb.report.dots import Block, Dot, DotColumn, dot_chart
 from lerobot_bomb.report.panels import Panel, Series
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.sentences import describe_comparison, describe_ranking, describe_series
-from lerobot_bomb.report.table import Cell, Section, Statement, Table
+from lerobot_bomb.report.table import MAX_TOLD, Cell, Section, Statement, Table
 from lerobot_bomb.results.groups import Group
 from lerobot_bomb.results.pairs import PairedComparison, describe_test
 from lerobot_bomb.results.record import NO_VALUE, Measure
 from lerobot_bomb.stats import SIGNIFICANT, Rate
 
 TITLE = "Success"
-MAX_TOLD = 6  # policies of a panel that have a sentence
 RATE_LABEL = "success, per cent"
 POINTS_LABEL = "change, percentage points"
-NOTE = f"Success: with {INTERVALS}."
+NOTE = (
+    "A condition such as camera:3 is one perturbation axis at level 3 of 5; all:3 is all axes at once. "
+    f"Success: with {INTERVALS}."
+)
 COST_NOTE = (
     "Change: from the same episodes unperturbed, with Newcombe's 95 % interval for pairs; filled where "
     "p < 0.05 by the exact McNemar test, adjusted for the policy's conditions (Holm)."

@@ -26,10 +26,10 @@ BLUE, RED = "#0072b2", "#d55e00"
 SUCCESS_TITLE = "Success by intersection that was named, per cent"
 MISSED_TITLE = "Stones put down nearest to another intersection than their target"
 MISSED_NOTE = (
-    "An arrow leads from the target to the intersection where the stone lies, as thick as it is frequent, "
-    "with the number at its end. A record holds the nearest intersection, not the point. Row 0 is the far "
-    "row."
+    "An arrow leads from the target to the intersection to which the stone lies nearest, with the number of "
+    "such stones beside it. Row 0 is the far row. Policies without an arrow have no such stone."
 )
+MAX_WIDE = 5  # stones of the widest arrow
 type Intersection = tuple[int, int]
 
 
@@ -142,7 +142,6 @@ def _paint_rates(axes: "Axes", board: BoardResults) -> None:
 
 
 def _paint_missed(axes: "Axes", board: BoardResults) -> None:
-    most = max(board.missed.values(), default=1)
     arrow = {
         "arrowstyle": "-|>",
         "color": RED,
@@ -151,13 +150,10 @@ def _paint_missed(axes: "Axes", board: BoardResults) -> None:
         "connectionstyle": "arc3,rad=0.15",
     }
     for ((row, column), (to_row, to_column)), number in board.missed.items():
-        width = 0.6 + 2.4 * number / most
+        width = 0.6 + 0.6 * min(number, MAX_WIDE)
         axes.annotate(
             "", (to_column, to_row), (column, row), arrowprops=arrow | {"linewidth": width}, zorder=2
         )
         axes.plot([column], [row], "o", color=INK, markersize=2.5, zorder=3)
-    ends = Counter[Intersection]()
-    for (_, place), number in board.missed.items():
-        ends[place] += number
-    for (row, column), number in ends.items():
-        axes.text(column + 0.14, row - 0.18, str(number), color=RED, fontweight="bold", zorder=4)
+        x, y = (column + to_column) / 2, (row + to_row) / 2
+        axes.text(x + 0.16, y - 0.1, str(number), color=RED, fontweight="bold", zorder=4)

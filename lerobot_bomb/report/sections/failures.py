@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from lerobot_bomb.report.cells import count, rate
 from lerobot_bomb.report.chart import COLORS, INK, MAX_BARS, WIDTH, Chart, chart_text, draw, tidy
 from lerobot_bomb.report.report import Report
-from lerobot_bomb.report.table import Cell, Section, Table
+from lerobot_bomb.report.table import MAX_TOLD, Cell, Section, Statement, Table
 from lerobot_bomb.results.bomb import are_placed, is_grounded, put_down
 from lerobot_bomb.results.groups import Group, by_condition
 from lerobot_bomb.results.record import Record
@@ -28,13 +28,25 @@ SPLIT_NOTE = (
 
 def section(report: Report) -> Section:
     """Write the section: stacked classes of each policy, unperturbed and perturbed."""
-    if all(each.is_success for group in report.groups for each in group.records):
+    if all(map(_all_succeed, report.groups)):
         return Section(TITLE, [])
     title = "How episodes ended: share of each class of failure"
     bars = outcomes(report)
     svg = _stacked(title, bars.header[2:], bars)
-    note = "Per cent of all episodes of a bar."
-    return Section(TITLE, [], charts=[Chart(title, svg, [bars, *map(failures, report.groups)], note)])
+    told = [_told(report.label(group), group) for group in report.groups if not _all_succeed(group)]
+    chart = Chart(title, svg, [bars, *map(failures, report.groups)], "Each bar is 100 % of its episodes.")
+    return Section(TITLE, [], statements=told[:MAX_TOLD], charts=[chart])
+
+
+def _all_succeed(group: Group) -> bool:
+    return all(each.is_success for each in group.records)
+
+
+def _told(name: str, group: Group) -> Statement:
+    """Say how the failed episodes ended: 'act fails 7 of 220 episodes: 4 dropped, 3 timeout.'."""
+    classes = Counter(each.failure for each in group.records if each.failure is not None)
+    ends = ", ".join(f"{number} {name}" for name, number in classes.most_common())
+    return Statement(name, f"fails {classes.total()} of {len(group.records)} episodes: {ends}.")
 
 
 def outcomes(report: Report) -> Table:

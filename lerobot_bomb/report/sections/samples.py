@@ -51,7 +51,9 @@ def _film(sample: Sample) -> str:
     words += [sample.note] if sample.note else []
     told = ". ".join(word.rstrip(".") for word in words if word)
     commands = "\n".join(filter(None, (sample.command, sample.explanation)))
-    return film_figure(sample.film, told, f"<pre>{escape(commands)}</pre>")
+    return film_figure(
+        sample.film, told, f"<figcaption>{escape(told)}</figcaption><pre>{escape(commands)}</pre>"
+    )
 
 
 def _table(name: str, samples: list[Sample]) -> Table:
