@@ -77,8 +77,8 @@ def test_without_millimetres_it_speaks_of_the_score() -> None:
     patches = {"observation.images.wrist": [[0.0, 3.5], [1e-5, 0.1]]}
     assert reasons([moment("grasp", patches=patches, words={"column": -0.02, "row": 1e-6})]) == [
         "Of all image patches, only wrist patch 0, 1 matters (3.5 nats at grasp).",
-        "Of the instruction, only the word for column (0.02 nats at grasp) decides, though weakly beside what "
-        "it sees; no other word does.",
+        "Of the instruction, only the word for column (0.02 nats at grasp) decides, though weakly beside "
+        "what it sees; no other word does.",
     ]
     assert reasons([moment("grasp", patches={"wrist": [[2.0, 3.5], [1e-5, 0.1]]})])[0] == (
         "2 of 4 image patches matter, most of all wrist patch 0, 1 (3.5 nats at grasp)."
