@@ -213,3 +213,11 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
             "policy_type",
             [pytest.param(each, marks=pytest.mark.long if each in slow else ()) for each in types],
         )
+
+
+@pytest.fixture
+def report(tmp_path: Path) -> "Callable[..., dict[str, Any]]":
+    """Return {title: section} of the report of rows, whose page is tmp_path / out / r.html."""
+    from report_cases import section_by_title
+
+    return functools.partial(section_by_title, tmp_path)
