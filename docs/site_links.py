@@ -48,3 +48,12 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return f"[![{text}]({url})]({url})" if image else f"[{text}]({url})"  # an image opens in full size
 
     return LINK.sub(link, markdown)
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """Name the theme's search for screen readers."""
+    named = 'aria-label="Search"'
+    output = output.replace('id="__search"', f'id="__search" {named}')
+    return output.replace(
+        'data-md-component="search" role="dialog"', f'data-md-component="search" role="dialog" {named}'
+    )
