@@ -4,6 +4,7 @@ import re
 
 from lerobot_bomb.report.chart import INK, Chart, chart_text
 from lerobot_bomb.report.dots import Block, Dot, DotColumn, dot_chart
+from lerobot_bomb.report.explanation import verdict_section
 from lerobot_bomb.report.page import MAX_ROWS, MAX_UNBROKEN, render
 from lerobot_bomb.report.table import Cell, Section, Statement, Table
 from lerobot_bomb.tables import MAX_NAME, shorten
@@ -78,3 +79,8 @@ def test_a_chart_takes_the_page_s_colour_and_is_the_same_each_time() -> None:
     assert svg.startswith('<svg role="img"') and "<title>title</title>" in svg
     assert "currentColor" in svg and INK not in svg and "<text" in svg and "http" not in svg
     assert "<style" not in svg and "<g id=" not in svg
+
+
+def test_a_verdict_and_an_instruction_are_text() -> None:
+    page = render(HOSTILE, [verdict_section([HOSTILE, HOSTILE], HOSTILE)])
+    assert "<script" not in page and page.count("&lt;script&gt;") >= 4
