@@ -14,7 +14,10 @@ EFFICIENCY = (
     "Efficiency: these records have neither the cost of queries nor smoothness, which earlier releases did "
     "not measure. Evaluate again."
 )
-VIDEOS = "Videos: lerobot-bomb report ... --videos=N replays N failures of each class, and shows them."
+FILMS = (
+    "Filmstrips: lerobot-bomb report ... --films=N replays N failures of each class, and shows them; "
+    "--videos=N adds videos."
+)
 
 
 def section(report: Report) -> Section:
@@ -22,7 +25,7 @@ def section(report: Report) -> Section:
     is_missing = {
         LANGUAGE: not language.section(report).tables,
         EFFICIENCY: not efficiency.is_measured(report),
-        VIDEOS: bool(report.samples) and not any(each.video or each.note for each in report.samples),
+        FILMS: bool(report.samples) and not any(each.film or each.note for each in report.samples),
     }
     lines = [line for line, missing in is_missing.items() if missing]
     return Section("Not in these files", [], lines)
