@@ -257,5 +257,5 @@ def test_a_checkpoint_that_points_is_explained_with_it(
     told = "It misreads the place" if found["place"] != found["meant_place"] else "It points at the place"
     assert told in capsys.readouterr().out
     page = (tmp_path / "why" / "explanation.html").read_text()
-    assert page.count("<img ") >= 1 + 2 + 2 and "What it points at" in page
+    assert page.count("<img ") == 1 + 2 + 1 and "What it points at" in page
     assert f"({found['meant_place']} is meant)" in page
