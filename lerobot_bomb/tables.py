@@ -18,6 +18,17 @@ def shorten(name: str, most: int = MAX_NAME) -> str:
     return f"{name[: most - 1 - last]}…{name[-last:]}"
 
 
+def in_a_row(names: Sequence[str]) -> str:
+    """Return 'a, b and c'."""
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def first_of(names: Sequence[str], most: int) -> list[str]:
+    """Return the first names, and how many more there are."""
+    more = len(names) - most
+    return [*names[:most]] + ([f"{more} more"] if more > 0 else [])
+
+
 def print_lines(*lines: str) -> None:
     """Print each text on one line, whatever is in it."""
     print(*map(printable, lines), sep="\n")

@@ -3,12 +3,14 @@
 They read the values of `explanation.json`.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from lerobot_bomb.bomb.episode import Failure
 from lerobot_bomb.bomb.judge import COLLATERAL_TOLERANCE_MM
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.explain.effects import Values
+from lerobot_bomb.results.summary import named_counts
 from lerobot_bomb.stats import format_rate
 
 # what happened, by failure class of BOMB
@@ -60,11 +62,9 @@ def _intersection(place: Sequence[int]) -> str:
 
 def count_outcomes(results: Sequence[Values]) -> str:
     """Return how often episodes succeeded, and the classes of the others."""
-    failures = [each["failure"] for each in results if not each["is_success"]]
-    counts = {name: failures.count(name) for name in sorted(set(failures), key=failures.count, reverse=True)}
-    classes = ", ".join(f"{name} {number}" for name, number in counts.items())
-    rate = format_rate(len(results) - len(failures), len(results))
-    return f"Success: {rate}{f'; failures: {classes}' if classes else ''}."
+    failures = Counter(each["failure"] for each in results if not each["is_success"])
+    rate = format_rate(len(results) - failures.total(), len(results))
+    return f"Success: {rate}{f'; failures: {named_counts(failures)}' if failures else ''}."
 
 
 def as_recorded(result: Values, recorded: Values | None) -> list[str]:

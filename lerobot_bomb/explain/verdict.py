@@ -27,6 +27,7 @@ from lerobot_bomb.explain.facts import (
     word_name,
 )
 from lerobot_bomb.explain.limits import RESTORES, SHARE, SMALLEST_MM, smallest_drop
+from lerobot_bomb.tables import first_of, in_a_row
 
 STONE = "stone"
 MAX_NAMES = 4  # that a sentence lists
@@ -217,7 +218,4 @@ def _restored(phase_moments: tuple[str, list[Values]]) -> tuple[float, str, dict
 
 def _listed(names: Sequence[str]) -> str:
     """Join names as "a, b and c", at most a few."""
-    shown = [*names[:MAX_NAMES]]
-    if len(names) > MAX_NAMES:
-        shown.append(f"{len(names) - MAX_NAMES} more")
-    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}" if shown else ""
+    return in_a_row(first_of(names, MAX_NAMES))

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 SIZE_INCHES = (7.6, 4.4)
 LABEL_M = 0.022  # of the numbers beside the board, beyond its outer lines
 DASHES = ("-", "--", ":", "-.")
-END_COLOR = COLORS[5]
 
 
 def film_html(name: str, run: EpisodeRun) -> str:

@@ -10,7 +10,7 @@ from lerobot_bomb.results.comparison import Comparisons, describe_verdict
 from lerobot_bomb.results.groups import rate_of, settings_of
 from lerobot_bomb.results.pairs import PairedComparison
 from lerobot_bomb.stats import SIGNIFICANT, Rate, format_p
-from lerobot_bomb.tables import shorten
+from lerobot_bomb.tables import first_of, in_a_row, shorten
 
 MAX_NAMED = 3  # names in a sentence
 MAX_PLACES = 6  # of a ranking
@@ -123,12 +123,7 @@ def _strength(compared: PairedComparison) -> tuple[bool, float]:
 def _named(costs: Sequence[PairedComparison]) -> str:
     """Return 'camera:3 (40 points less, p = 0.001) and light:3 (...)'."""
     names = [f"{each.condition} ({_points(each)}, {format_p(each.p_value)})" for each in costs]
-    return in_a_row(_some(names))
-
-
-def in_a_row(names: Sequence[str]) -> str:
-    """Return 'a, b and c'."""
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+    return in_a_row(first_of(names, MAX_NAMED))
 
 
 def _no_difference(others: Sequence[PairedComparison], kind: str) -> str:
@@ -163,12 +158,12 @@ def describe_ranking(panel: Panel) -> Iterator[Statement]:
     for each in panel.ranked:
         tied.setdefault(rates[each.policy].share, []).append(shorten(each.policy))
     places = [
-        f"{in_a_row(_some(names))} {'tie at ' if len(names) > 1 else ''}{100 * share:.0f} %"
+        f"{in_a_row(first_of(names, MAX_NAMED))} {'tie at ' if len(names) > 1 else ''}{100 * share:.0f} %"
         for share, names in tied.items()
     ]
     number = len(records[0])
     episodes = f"{number} {kind}episodes" if number > 1 else f"one {kind}episode"
-    told = ", ".join(_some(places, MAX_PLACES))
+    told = ", ".join(first_of(places, MAX_PLACES))
     yield Statement(f"Ranking{suite}", f"by the {episodes} that all policies have: {told}.")
 
 
@@ -179,12 +174,6 @@ def _why_not_ranked(panel: Panel) -> str:
         if specs[first].isdisjoint(specs[second]):
             return f"{shorten(first)} and {shorten(second)} have no episode in common"
     return "no episode was run by all policies, though each two of them have some in common"
-
-
-def _some(names: Sequence[str], most: int = MAX_NAMED) -> list[str]:
-    """Return the first names, and how many more there are."""
-    more = len(names) - most
-    return [*names[:most]] + ([f"{more} more"] if more > 0 else [])
 
 
 def describe_comparison(first: Series, second: Series, compared: Comparisons) -> Statement:

@@ -1,8 +1,7 @@
 """Title of a report: what was evaluated."""
 
-from lerobot_bomb.report.chart import shorten
 from lerobot_bomb.report.report import Report
-from lerobot_bomb.report.sentences import in_a_row
+from lerobot_bomb.tables import in_a_row, shorten
 
 MAX_NAMED = 3  # policies and suites that a title names
 
