@@ -18,6 +18,11 @@ class LiberoActuator:
         self._rng = generator(seed, Stream.ACTUATOR_NOISE)
         self._pending = deque([np.array(get_libero_dummy_action(), np.float32)] * dynamics.latency)
 
+    @property
+    def pending(self) -> np.ndarray:
+        """(6,) sum of the motions that latency holds back."""
+        return np.sum([np.zeros(MOTION_DIMS), *(each[:MOTION_DIMS] for each in self._pending)], axis=0)
+
     def command(self, action: np.ndarray) -> np.ndarray:
         """(7,) action -> (7,) command to the arm."""
         self._pending.append(action)

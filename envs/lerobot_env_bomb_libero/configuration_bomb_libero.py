@@ -10,12 +10,14 @@ from lerobot.envs import EnvConfig, env_to_policy_features
 from lerobot.envs.configs import LiberoEnv
 from lerobot.utils.constants import LIBERO_KEY_PIXELS_AGENTVIEW, OBS_IMAGES, OBS_STATE
 
+from lerobot_bomb.checkpoints.acting import acting_config
 from lerobot_bomb.checkpoints.env_config import EvaluatedEnv
 from lerobot_bomb.checkpoints.interface import Interface
 from lerobot_bomb.checkpoints.libero_orientation import OrientationCheck
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.libero.assets import SUITES, prepare_libero
-from lerobot_bomb.libero.episode import STATE_DIM, TASKS_PER_SUITE, LiberoSpec
+from lerobot_bomb.libero.episode import LIBERO_FPS, STATE_DIM, TASKS_PER_SUITE, LiberoSpec
+from lerobot_bomb.libero.goals import check_goals
 from lerobot_bomb.libero.perturbations import LiberoCondition
 
 CONTROL_MODES = ("relative", "absolute")
@@ -58,6 +60,8 @@ class BombLiberoEnvConfig(EvaluatedEnv, LiberoEnv):
         }
 
     def _check_policy(self) -> None:
+        if self._is_guided:
+            self._check_guide()
         state = PolicyFeature(type=FeatureType.STATE, shape=(STATE_DIM,))
         Interface(
             str(self.type),
@@ -66,6 +70,25 @@ class BombLiberoEnvConfig(EvaluatedEnv, LiberoEnv):
             "relative motions",
             lambda height, width: f"--env.observation_height={height} --env.observation_width={width}",
         ).check_acting_policy()
+
+    @property
+    def _is_guided(self) -> bool:
+        """True if the policy that acts reads the simulator's true state."""
+        return getattr(acting_config(), "reads_true_state", False)
+
+    def _check_guide(self) -> None:
+        """Raise a ValueError for what the scripted expert cannot do."""
+        for name, value, allowed in (
+            ("control_mode", self.control_mode, "relative"),
+            ("fps", self.fps, LIBERO_FPS),
+        ):
+            if value != allowed:
+                raise ValueError(f"--env.{name}={value}: the expert acts with --env.{name}={allowed} only")
+        check_goals({spec for specs in self.groups.values() for spec in specs.values()})
+
+    def _known_late(self, num_envs: int) -> list[dict[str, Any]]:
+        late = super()._known_late(num_envs)
+        return [{**each, "is_guided": True} for each in late] if self._is_guided else late
 
     def _import_env(self) -> type:
         prepare_libero(self.suites)

@@ -3,16 +3,26 @@
 from dataclasses import dataclass
 from typing import Any
 
+import gymnasium
 import numpy as np
 
+from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
 from lerobot_bomb.envs.perturbation import transforms_of
-from lerobot_bomb.libero.episode import LiberoFailure, LiberoSpec, initial_state_of, libero_failure_of
+from lerobot_bomb.libero.episode import (
+    MOTION_DIMS,
+    LiberoFailure,
+    LiberoSpec,
+    initial_state_of,
+    libero_failure_of,
+)
+from lerobot_bomb.libero.expert import LiberoState
 from lerobot_bomb.results.libero import LiberoResult
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_env_bomb_libero.actuator import LiberoActuator
 from lerobot_env_bomb_libero.axes.dynamics import LiberoDynamics
 from lerobot_env_bomb_libero.episode import LiberoEpisode, sample_libero_episode
+from lerobot_env_bomb_libero.expert.guide import Guide
 from lerobot_env_bomb_libero.scene import LiberoScene
 
 
@@ -23,6 +33,7 @@ class _Run:
     episode: LiberoEpisode
     actuator: LiberoActuator | None  # None: actions are executed as they are
     touched: set[str]  # objects and fixtures that the gripper has touched
+    guide: Guide | None = None  # the scripted expert's plan
 
 
 class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
@@ -44,8 +55,18 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
         results_path: str | None = None,
         render_mode: str | None = "rgb_array",
         policy: PolicyIdentity | None = None,
+        is_guided: bool = False,
     ):
-        """`scene`: arguments of LeRobot's environment beside suite and task."""
+        """Make the environment of a task.
+
+        Args:
+            spec: of its episodes, which differ in their seeds.
+            scene: arguments of LeRobot's environment beside suite and task.
+            results_path: file that gets a record of each episode.
+            render_mode: as Gymnasium has it.
+            policy: that acts, for the records.
+            is_guided: add what the scripted expert reads to observations, as `environment_state`.
+        """
         from libero.libero import benchmark  # slow
 
         suite = benchmark.get_benchmark_dict()[spec.suite]()
@@ -63,13 +84,20 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
         self._policy = policy
         self._is_success = False
         self.action_space, self.observation_space = self._scene.action_space, self._scene.observation_space
+        self._is_guided = is_guided
+        if is_guided:
+            state = gymnasium.spaces.Box(-np.inf, np.inf, (LiberoState.DIM,), np.float32)
+            self.observation_space = gymnasium.spaces.Dict(
+                {**self._scene.observation_space.spaces, ENVIRONMENT_STATE: state}
+            )
 
     def _begin(self, spec: LiberoSpec) -> tuple[Observation, dict[str, Any]]:
         episode = sample_libero_episode(spec, self._instruction)
         observation = self._scene.begin(spec.seed, tuple(episode.perturbation.transforms.values()))
         dynamics = episode.perturbation.of(LiberoDynamics)
         actuator = None if dynamics is None else LiberoActuator(dynamics, spec.seed)
-        self._current_run = _Run(episode, actuator, set())
+        guide = Guide(self._scene) if self._is_guided else None
+        self._current_run = _Run(episode, actuator, set(), guide)
         self._is_success = False
         self.task_description = episode.instruction
         return self._sensed(observation), {"is_success": False, "failure": "", "seed": spec.seed}
@@ -114,10 +142,18 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
     @property
     def _failure(self) -> LiberoFailure | None:
         """Reason why the episode failed, were it to end now."""
-        return None if self._is_success else libero_failure_of(self._run.touched, self._scene.wanted)
+        if self._is_success:
+            return None
+        if (guide := self._run.guide) is not None and guide.failure is not None:
+            return guide.failure
+        return libero_failure_of(self._run.touched, self._scene.wanted)
 
     def _sensed(self, observation: Observation) -> Observation:
         """Return LeRobot's observation with its images as the cameras' sensors take them in this step."""
         sense = self._run.episode.perturbation.sense
         pixels = {name: sense(image, self._steps) for name, image in observation["pixels"].items()}
-        return observation | {"pixels": pixels}
+        observation = observation | {"pixels": pixels}
+        if (guide := self._run.guide) is None:
+            return observation
+        pending = np.zeros(MOTION_DIMS) if self._run.actuator is None else self._run.actuator.pending
+        return observation | {ENVIRONMENT_STATE: guide.state(pending).to_vector()}

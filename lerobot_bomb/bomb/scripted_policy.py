@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import NoReturn
+from typing import ClassVar, NoReturn
 
 import numpy as np
 import torch
@@ -20,6 +20,11 @@ from lerobot_bomb.compat.use import use
 @dataclass
 class ScriptedConfig(PreTrainedConfig):
     """Config of a policy without weights."""
+
+    # whether it reads the simulator's true state, which environments then add to observations
+    reads_true_state: ClassVar[bool] = True
+    # {env type in which it acts: dimensions of an action there}
+    env_types: ClassVar[dict[str, int]] = {"bomb": ACTION_DIM}
 
     # publish the policy on the Hub
     push_to_hub: bool = False
@@ -52,10 +57,12 @@ class ScriptedConfig(PreTrainedConfig):
         self.refuse_training()
 
     def validate_features(self) -> None:
-        if self.action_feature is None or self.action_feature.shape != (ACTION_DIM,):
+        shape = None if self.action_feature is None else self.action_feature.shape
+        if shape not in [(dim,) for dim in self.env_types.values()]:
             raise ValueError(
-                f"--policy.type={self.type} acts in --env.type=bomb only, where an action has {ACTION_DIM} "
-                f"numbers; here the outputs are {self.output_features}"
+                f"--policy.type={self.type} acts in --env.type={' and '.join(self.env_types)} only, where an "
+                f"action has {' and '.join(map(str, self.env_types.values()))} numbers; here the outputs are "
+                f"{self.output_features}"
             )
 
     def refuse_training(self) -> NoReturn:
@@ -88,13 +95,15 @@ class ScriptedPolicy(PreTrainedPolicy):
         """Observation ``environment_state`` (B, PrivilegedState.dim(G)) -> (B, D) actions in env units."""
         if OBS_ENV_STATE not in batch:
             raise ValueError(
-                f"--policy.type={self.name} needs the observation {OBS_ENV_STATE!r}, which only "
-                f"--env.type=bomb gives; got {sorted(batch)}"
+                f"--policy.type={self.name} needs the observation {OBS_ENV_STATE!r}, the true state that "
+                f"--env.type={' and '.join(self.config.env_types)} give; got {sorted(batch)}"
             )
-        states = map(PrivilegedState.from_vector, batch[OBS_ENV_STATE].cpu().numpy())
-        actions = np.stack([self.act(state, self._step) for state in states])
+        actions = np.stack([self._act(vector) for vector in batch[OBS_ENV_STATE].cpu().numpy()])
         self._step += 1
         return torch.from_numpy(actions.astype(np.float32))
+
+    def _act(self, vector: np.ndarray) -> np.ndarray:
+        return self.act(PrivilegedState.from_vector(vector), self._step)
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **_: object) -> Tensor:
         """(B, 1, D): a chunk of one step."""

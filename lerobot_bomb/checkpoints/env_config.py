@@ -67,6 +67,10 @@ class EvaluatedEnv(_EnvConfig):
         """Return a function that maps a spec to the one to call with its first observations, or to None."""
         return lambda spec: None
 
+    def _known_late(self, num_envs: int) -> list[dict[str, Any]]:
+        """Return for each environment its arguments that are known once the policy is built."""
+        return policy_of_results(self.results_path, num_envs)
+
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
         """Return LeRobot's processors, after a check of the policy that acts.
 
@@ -92,7 +96,7 @@ class EvaluatedEnv(_EnvConfig):
                 task_id: LazyVectorEnv(
                     [partial(make_env, **(kwargs | {"spec": spec}))] * n_envs,
                     use_async=use_async_envs and n_envs > 1,
-                    known_late=partial(policy_of_results, self.results_path),
+                    known_late=self._known_late,
                     last_query=last_query,
                     on_first_reset=on_first_reset(spec),
                     num_tasks=sum(map(len, groups.values())),

@@ -28,10 +28,17 @@ from lerobot_bomb.commands.cluster_jobs import (
     submitted,
     write_job_array,
 )
+from lerobot_bomb.commands.record_libero import (
+    BOMB_LIBERO,
+    FLAG_OF,
+    add_env_type_arguments,
+    libero_recording,
+    refuse_libero_flags,
+)
 from lerobot_bomb.data.kept_blocks import Progress, read_progress
 from lerobot_bomb.data.parts import Part, check_part, join, num_whole_blocks, record_part, unfinished_parts
 from lerobot_bomb.data.record import record
-from lerobot_bomb.data.recorded_blocks import BehaviorPolicy, EpisodeSource, describe_failures
+from lerobot_bomb.data.recorded_blocks import AnyRecording, BehaviorPolicy, EpisodeSource, describe_failures
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import (
     block_episodes,
@@ -50,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add_new_dataset_arguments(parser)
     add = parser.add_argument
+    add_env_type_arguments(parser)
     _add_what_is_recorded(parser)
     add(
         "--seed",
@@ -112,9 +120,11 @@ def run(args: argparse.Namespace) -> int:
     check_num_jobs(args, num_whole_blocks(recording), f"parts of at least {len(block_episodes(0))} episodes")
     if num_jobs := args.slurm or args.submitit:
         return _record_by_jobs(args, [Part(recording, index, num_jobs) for index in range(num_jobs)], root)
-    _warn_of_test_seeds(recording)
+    if isinstance(recording, Recording):
+        _warn_of_test_seeds(recording)
     with terminated_in_order():
-        behavior = _behavior_policy(recording, args.policy_path) if recording.relabel else None
+        is_relabelled = isinstance(recording, Recording) and recording.relabel
+        behavior = _behavior_policy(recording, args.policy_path) if is_relabelled else None
         if shard is not None:
             return _record_part(Part(recording, *shard), root, EpisodeSource(args.workers, behavior=behavior))
         if args.join:
@@ -127,16 +137,13 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _recording(args: argparse.Namespace) -> Recording:
-    flags = vars(args)
-    if args.static == 0:
-        raise ValueError("--static=0 records nothing; give a number of scenes, or --episodes")
-    if args.image_size is None:
-        trained = None if args.policy_path is None else trained_image_size(args.policy_path)
-        args.image_size = flags["image_size"] = trained or DEFAULT_IMAGE_SIZE
-    given: dict[str, Any] = {f.name: flags[f.name] for f in fields(Recording) if f.name in flags}
-    given |= {"episodes": args.episodes or 0, "static": args.static or 0, "relabel": _acting_weights(args)}
-    recording = Recording(**given)
+def _recording(args: argparse.Namespace) -> AnyRecording:
+    if args.env_type == BOMB_LIBERO:
+        parser = argparse.ArgumentParser()
+        add_arguments(parser)
+        recording = libero_recording(args, parser.get_default)
+    else:
+        recording = _bomb_recording(args)
     if not 1 <= args.workers <= recording.episodes:
         raise ValueError(
             f"--workers={args.workers} must lie in 1..{recording.episodes} (--episodes or --static)"
@@ -144,7 +151,20 @@ def _recording(args: argparse.Namespace) -> Recording:
     return recording
 
 
-def _print(recording: Recording, progress: Progress, where: Path, num_before: int = 0) -> None:
+def _bomb_recording(args: argparse.Namespace) -> Recording:
+    flags = vars(args)
+    refuse_libero_flags(args)
+    if args.static == 0:
+        raise ValueError("--static=0 records nothing; give a number of scenes, or --episodes")
+    if args.image_size is None:
+        trained = None if args.policy_path is None else trained_image_size(args.policy_path)
+        args.image_size = flags["image_size"] = trained or DEFAULT_IMAGE_SIZE
+    given: dict[str, Any] = {f.name: flags[f.name] for f in fields(Recording) if f.name in flags}
+    given |= {"episodes": args.episodes or 0, "static": args.static or 0, "relabel": _acting_weights(args)}
+    return Recording(**given)
+
+
+def _print(recording: AnyRecording, progress: Progress, where: Path, num_before: int = 0) -> None:
     """Print what was recorded, after `num_before` episodes that other parts tried."""
     conditions, scenes = len(recording.conditions), recording.scenes
     first = recording.seed + num_before // conditions * scenes
@@ -194,7 +214,7 @@ def _job_command(args: argparse.Namespace, root: Path) -> list[str]:
     for name, value in vars(args).items():
         if name in NOT_OF_JOBS or value in (None, False, ()):
             continue
-        flag = "policy.path" if name == "policy_path" else name
+        flag = FLAG_OF.get(name, name)
         text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
         flags.append(f"--{flag}={'true' if value is True else text}")
     return [*PYTHON, "lerobot_bomb.commands.main", "record", *flags]

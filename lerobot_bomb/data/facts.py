@@ -12,6 +12,8 @@ from lerobot_bomb.data.dataset_files import EPISODES_FOLDER, INFO_FILE, read_par
 from lerobot_bomb.data.recording import SCENES
 from lerobot_bomb.data.unfinished import METADATA_FILE
 from lerobot_bomb.files import read_json
+from lerobot_bomb.libero.episode import TASKS_PER_SUITE
+from lerobot_bomb.results.libero import LiberoResult
 
 PUSHT_SOURCE = "pusht-zarr"
 LIBERO_SOURCE = "libero-hdf5"
@@ -56,6 +58,11 @@ class DatasetFacts:
         return self.bomb.get("recording", {})
 
     @property
+    def _is_libero(self) -> bool:
+        """True for a recording of LIBERO's expert."""
+        return self.recording.get("env_type") == LiberoResult.env_type
+
+    @property
     def conversion(self) -> dict[str, Any]:
         """Parameters of `lerobot-bomb convert`, or {}."""
         return self.bomb.get("conversion", {})
@@ -79,6 +86,8 @@ class DatasetFacts:
     def eval_flags(self) -> list[str] | None:
         """Return lerobot-eval's flags for the dataset's environment; None if unknown."""
         conversion = self.conversion
+        if self._is_libero:
+            return ["--env.type=bomb_libero", *self._libero_flags(self.recording["task"])[1:]]
         if conversion.get("source", "").startswith(PUSHT_SOURCE):
             return ["--env.type=pusht", "--eval.use_async_envs=false"]
         if conversion.get("source", "").startswith(LIBERO_SOURCE):
@@ -114,7 +123,11 @@ class DatasetFacts:
         recording = self.recording
         if not recording:
             return None if self.specs is None else sorted({spec["seed"] for spec in self.specs})
-        num_tasks = len(suites_of(recording["task"])) * max(1, len(recording["task_ids"]))
+        task, task_ids = recording["task"], recording["task_ids"]
+        if self._is_libero:
+            num_tasks = len(task_ids) or TASKS_PER_SUITE[task]
+        else:
+            num_tasks = len(suites_of(task)) * max(1, len(task_ids))
         num_conditions = len(recording["perturbations"]) * num_tasks
         num_tried = self.bomb["num_episodes"] + len(self.bomb["failures"])
         num_seeds = -(-num_tried // num_conditions) * (min(recording.get("static", 0), SCENES) or 1)
@@ -125,6 +138,14 @@ class DatasetFacts:
         if not recording or seeds is None:
             return []
         num_failed = len(self.bomb.get("failures", []))
+        if self._is_libero:
+            return [
+                f"- LIBERO's suite {recording['task']}, tasks: {recording['task_ids'] or 'all'}",
+                f"- perturbation axes: {', '.join(recording['perturbations'])}; noise on actions: "
+                f"{recording['noise']:g}",
+                f"- seeds {seeds[0]}..{seeds[-1]}; failed episodes that were left out: {num_failed}",
+                f"- recorded with lerobot_bomb {recording['package_version']}",
+            ]
         given = [f"{name} {recording[name]}" for name in ("target", "color") if recording.get(name)]
         tasks = recording["task_ids"] or ", ".join(given) or "drawn per episode"
         return [

@@ -12,11 +12,11 @@ from lerobot_bomb.data.libero_hdf5 import CONVENTIONS, LiberoHdf5
 from lerobot_bomb.data.resumable import check_repo_id, grow
 from lerobot_bomb.data.unfinished import check_folders, unfinished_folder
 from lerobot_bomb.flags import one_of
+from lerobot_bomb.libero.episode import LIBERO_FPS
 
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 
-FPS = 20  # of the demonstrations and of LeRobot's environment `libero`
 ROBOT_TYPE = "panda"
 KEYS = ("observation.images.image", "observation.images.image2")
 POSE = ("x", "y", "z", "rx", "ry", "rz")
@@ -69,7 +69,7 @@ def convert_libero(
     source.check()
 
     def layout() -> "DatasetLayout":
-        return _layout(repo_id, source.image_shape, use_videos=not images)
+        return libero_layout(repo_id, source.image_shape, use_videos=not images)
 
     return grow(
         conversion,
@@ -82,7 +82,7 @@ def convert_libero(
     )
 
 
-def _layout(repo_id: str, image_shape: tuple[int, int, int], use_videos: bool) -> "DatasetLayout":
+def libero_layout(repo_id: str, image_shape: tuple[int, int, int], use_videos: bool) -> "DatasetLayout":
     """Return the layout, with the keys under which a policy sees LeRobot's environment `libero`."""
     from lerobot_bomb.data.blocks import DatasetLayout
 
@@ -96,7 +96,7 @@ def _layout(repo_id: str, image_shape: tuple[int, int, int], use_videos: bool) -
         "observation.state": {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": STATE_NAMES},
         "action": {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": ACTION_NAMES},
     }
-    return DatasetLayout(repo_id, FPS, ROBOT_TYPE, features, use_videos)
+    return DatasetLayout(repo_id, LIBERO_FPS, ROBOT_TYPE, features, use_videos)
 
 
 def _recorded_episode(source: LiberoHdf5, index: int) -> "RecordedEpisode":

@@ -15,8 +15,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from lerobot_bomb.data.kept_blocks import Progress, block_damage, block_path, find_gaps, reached
-from lerobot_bomb.data.recorded_blocks import ANY_NUMBER, EpisodeSource, record_blocks, recording_layout
-from lerobot_bomb.data.recording import Recording
+from lerobot_bomb.data.recorded_blocks import (
+    ANY_NUMBER,
+    AnyRecording,
+    EpisodeSource,
+    record_blocks,
+    recording_layout,
+)
 from lerobot_bomb.data.resumable import block_episodes, grow, growing
 from lerobot_bomb.data.unfinished import (
     check_folders,
@@ -36,7 +41,7 @@ class Part:
 
     kind: ClassVar[str] = "recording"
 
-    recording: Recording
+    recording: AnyRecording
     index: int
     number: int  # of parts
 
@@ -58,7 +63,7 @@ class Part:
         return parts_folder(root) / f"{self.index}-of-{self.number}.recording"
 
 
-def num_whole_blocks(recording: Recording) -> int:
+def num_whole_blocks(recording: AnyRecording) -> int:
     """Return the number of whole blocks of a recording in which no episode fails."""
     return recording.episodes // len(block_episodes(0))
 
@@ -107,7 +112,7 @@ def check_part(part: Part, root: Path) -> None:
         _check_same(flag, Part(part.recording, index, number), root)
 
 
-def join(recording: Recording, root: Path, source: EpisodeSource) -> Progress:
+def join(recording: AnyRecording, root: Path, source: EpisodeSource) -> Progress:
     """Join the parts into the dataset at `root`, replace failed episodes, and delete the parts.
 
     Raises:
@@ -156,7 +161,7 @@ def unfinished_parts(parts: list[Part], root: Path) -> dict[Part, str]:
     return found
 
 
-def _whole_parts(recording: Recording, root: Path) -> list[Part]:
+def _whole_parts(recording: AnyRecording, root: Path) -> list[Part]:
     """Return the parts of a recording, once all of them are there and finished."""
     folder, found = parts_folder(root), _found(root)
     numbers = sorted({number for _, number in found})

@@ -1,4 +1,4 @@
-"""The scripted expert's episodes as a LeRobotDataset.
+"""The scripted expert's episodes, in BOMB or LIBERO, as a LeRobotDataset.
 
 A recording grows in a folder beside its final place (see ``resumable.py``).
 """
@@ -9,14 +9,19 @@ from pathlib import Path
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.data.kept_blocks import Progress
 from lerobot_bomb.data.parts import check_no_parts
-from lerobot_bomb.data.recorded_blocks import BehaviorPolicy, EpisodeSource, record_blocks, recording_layout
-from lerobot_bomb.data.recording import Recording
+from lerobot_bomb.data.recorded_blocks import (
+    AnyRecording,
+    BehaviorPolicy,
+    EpisodeSource,
+    record_blocks,
+    recording_layout,
+)
 from lerobot_bomb.data.resumable import grow
 from lerobot_bomb.envs.rollout import Expert
 
 
 def record(
-    recording: Recording,
+    recording: AnyRecording,
     root: Path,
     num_workers: int = 1,
     resume: bool = False,

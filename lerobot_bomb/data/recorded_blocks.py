@@ -15,10 +15,11 @@ from tqdm import tqdm
 
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.data.kept_blocks import Progress, episodes_before, reached
+from lerobot_bomb.data.libero_recording import LiberoRecording, LiberoRollout
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import add_block, block_episodes, missing_blocks
-from lerobot_bomb.data.rollout_pool import RelabelledRollouts, Rollout, RolloutPool, RolloutSettings
-from lerobot_bomb.envs.rollout import Agent, Expert, make_env
+from lerobot_bomb.data.rollout_pool import RelabelledRollouts, Rollout, RolloutPool, RolloutSettings, Settings
+from lerobot_bomb.envs.rollout import Agent, Expert
 
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
@@ -27,6 +28,9 @@ ANY_NUMBER = sys.maxsize
 # the expert counts as broken if, after so many episodes, fewer succeed
 MIN_TRIED = 20
 MIN_SUCCESS_RATE = 0.1
+
+
+type AnyRecording = Recording | LiberoRecording
 
 
 @dataclass(frozen=True)
@@ -45,23 +49,28 @@ class EpisodeSource:
     expert: Expert = expert_action
     behavior: BehaviorPolicy | None = None  # the expert says what it would have done
 
-    def rollouts(self, recording: Recording, num_tried: int) -> RolloutPool | RelabelledRollouts:
+    def rollouts(self, recording: AnyRecording, num_tried: int) -> RolloutPool | RelabelledRollouts:
         """Return the episodes of a recording after the first `num_tried`."""
-        settings = RolloutSettings(
+        settings, specs = self.settings(recording), recording.specs(num_tried)
+        if self.behavior is None or not isinstance(settings, RolloutSettings):
+            return RolloutPool(settings, specs, self.num_workers)
+        return RelabelledRollouts(settings, specs, self.behavior.begin, self.behavior.agent)
+
+    def settings(self, recording: AnyRecording) -> Settings:
+        """Return how a recording's episodes are run."""
+        if isinstance(recording, LiberoRecording):
+            return recording.settings
+        return RolloutSettings(
             recording.render_options,
             recording.noise,
             self.expert,
             recording.scenes if recording.static else 0,
             recording.pointing,
         )
-        specs = recording.specs(num_tried)
-        if self.behavior is None:
-            return RolloutPool(settings, specs, self.num_workers)
-        return RelabelledRollouts(settings, specs, self.behavior.begin, self.behavior.agent)
 
 
 def record_blocks(
-    recording: Recording,
+    recording: AnyRecording,
     folder: Path,
     source: EpisodeSource,
     numbers: range = range(ANY_NUMBER),
@@ -75,9 +84,10 @@ def record_blocks(
     if not gaps:
         return
     # MuJoCo's backend is chosen here, or its absence reported; the workers inherit the choice
+    settings = source.settings(recording)
     with recording.flag_names():
         for spec in recording.conditions:
-            make_env(spec, recording.render_options).close()
+            settings.make_env(spec).close()
     run = reached(folder)
     total = min(most, block_episodes(numbers.stop).start - block_episodes(numbers.start).start)
     with tqdm(total=total, initial=run.num_episodes, unit="episode") as bar:
@@ -86,12 +96,12 @@ def record_blocks(
 
 
 def _fill(
-    recording: Recording,
+    recording: AnyRecording,
     folder: Path,
     source: EpisodeSource,
     gap: range,
     most: int,
-    successes: "Callable[[Iterable[Rollout], int, Progress], Iterator[RecordedEpisode]]",
+    successes: "Callable[[Iterable[Rollout | LiberoRollout], int, Progress], Iterator[RecordedEpisode]]",
 ) -> None:
     """Make the blocks of a gap, until the folder holds `most` episodes."""
     left = most - episodes_before(folder, gap.start)
@@ -107,16 +117,14 @@ def _fill(
 
 
 def _successes(
-    run: Progress, bar: tqdm, pool: Iterable[Rollout], most: int, progress: Progress
+    run: Progress, bar: tqdm, pool: Iterable[Rollout | LiberoRollout], most: int, progress: Progress
 ) -> "Iterator[RecordedEpisode]":
     """Yield a block's successful rollouts, at most `most`; count the failed ones on the way."""
-    from lerobot_bomb.data.rollout_dataset import rollout_episode
-
     for rollout in islice(pool, len(block_episodes(0))):
         if rollout.num_steps:
             progress.num_episodes += 1
             run.num_episodes += 1
-            yield rollout_episode(rollout)
+            yield _recorded(rollout)
             bar.update()
         else:
             failure = {"seed": rollout.result.spec.seed, "failure": rollout.result.failure}
@@ -126,6 +134,16 @@ def _successes(
             _check_success_rate(run)
         if progress.num_episodes == most:
             return
+
+
+def _recorded(rollout: "Rollout | LiberoRollout") -> "RecordedEpisode":
+    if isinstance(rollout, LiberoRollout):
+        from lerobot_bomb.data.libero_dataset import libero_episode
+
+        return libero_episode(rollout)
+    from lerobot_bomb.data.rollout_dataset import rollout_episode
+
+    return rollout_episode(rollout)
 
 
 def _check_success_rate(progress: Progress) -> None:
@@ -149,8 +167,12 @@ def describe_failures(failures: list[dict[str, Any]]) -> str:
     return f"{len(failures)} failed and were left out: {classes}"
 
 
-def recording_layout(recording: Recording) -> "DatasetLayout":
+def recording_layout(recording: AnyRecording) -> "DatasetLayout":
     """Return the layout of a recording's dataset."""
+    if isinstance(recording, LiberoRecording):
+        from lerobot_bomb.data.libero_dataset import libero_recording_layout
+
+        return libero_recording_layout(recording)
     from lerobot_bomb.data.rollout_dataset import rollout_layout
 
     return rollout_layout(recording)

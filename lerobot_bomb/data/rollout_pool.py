@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from typing import Any, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import gymnasium
 import numpy as np
@@ -33,18 +33,38 @@ from lerobot_bomb.bomb.streams import Stream, generator, recorder_noise
 from lerobot_bomb.envs.rollout import Agent, Expert, add_noise, expert_agent, make_env, run_episode
 from lerobot_bomb.results.bomb import EpisodeResult
 
-MAX_ENVS = 8  # that a worker keeps; each holds an OpenGL context
+
+class Settings(Protocol):
+    """Settings of rollouts; with a spec they determine one."""
+
+    max_envs: ClassVar[int]  # that a worker keeps; each holds an OpenGL context
+
+    def make_env(self, spec: Any) -> gymnasium.Env:
+        """Make the environment of a spec's episodes."""
+        ...
+
+    def collect(self, env: gymnasium.Env, spec: Any, agent: Agent | None = None) -> Any:
+        """Run a spec's episode; return a picklable rollout with `result` and `num_steps`."""
+        ...
 
 
 @dataclass(frozen=True)
 class RolloutSettings:
-    """Settings of a rollout; with a spec they determine it."""
+    """Settings of BOMB's rollouts."""
+
+    max_envs: ClassVar[int] = 8
 
     render_options: RenderOptions
     noise: float = 0.0  # standard deviation on x, y and z, in units of the largest relative step
     expert: Expert = expert_action
     static: int = 0  # number of scenes instead of an episode; 0: an episode
     pointing: bool = False  # label what the expert points at
+
+    def make_env(self, spec: EpisodeSpec) -> gymnasium.Env:
+        return make_env(spec, self.render_options)
+
+    def collect(self, env: gymnasium.Env, spec: EpisodeSpec, agent: Agent | None = None) -> "Rollout":
+        return collect(env, spec, self, agent)
 
 
 @dataclass(frozen=True)
@@ -170,7 +190,7 @@ class RolloutPool:
         RuntimeError: a worker has ended by itself.
     """
 
-    def __init__(self, settings: RolloutSettings, specs: Iterator[EpisodeSpec], num_workers: int) -> None:
+    def __init__(self, settings: Settings, specs: Iterator[Any], num_workers: int) -> None:
         context = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
         self._specs = specs
         self._processes: list[SpawnProcess] = []
@@ -205,7 +225,7 @@ class RolloutPool:
     def __iter__(self) -> Self:
         return self
 
-    def __next__(self) -> Rollout:
+    def __next__(self) -> Any:
         process, pipe = next(self._turns)
         try:
             rollout = pipe.recv()
@@ -222,7 +242,7 @@ class RolloutPool:
             pipe.send(next(self._specs))
 
 
-def _work(settings: RolloutSettings, pipe: Connection) -> None:
+def _work(settings: Settings, pipe: Connection) -> None:
     """Run a worker: receive specs, send rollouts or an exception, until the parent ends."""
     worker = _Worker(settings)
     with suppress(EOFError, ConnectionError):
@@ -234,23 +254,23 @@ def _work(settings: RolloutSettings, pipe: Connection) -> None:
 class _Worker:
     """Worker that keeps an environment of each of the last few conditions between episodes."""
 
-    def __init__(self, settings: RolloutSettings, agent: Agent | None = None) -> None:
+    def __init__(self, settings: Settings, agent: Agent | None = None) -> None:
         self._settings, self._agent = settings, agent
-        self._envs: dict[EpisodeSpec, gymnasium.Env] = {}
+        self._envs: dict[Any, gymnasium.Env] = {}
 
-    def rollout(self, spec: EpisodeSpec) -> Rollout | Exception:
+    def rollout(self, spec: Any) -> Any:
         try:
-            return collect(self._env_of(spec), spec, self._settings, self._agent)
+            return self._settings.collect(self._env_of(spec), spec, self._agent)
         except Exception as error:
             return error
 
-    def _env_of(self, spec: EpisodeSpec) -> gymnasium.Env:
+    def _env_of(self, spec: Any) -> gymnasium.Env:
         condition = replace(spec, seed=0)
         env = self._envs.pop(condition, None)
         if env is None:
-            if len(self._envs) == MAX_ENVS:
+            if len(self._envs) == self._settings.max_envs:
                 self._envs.pop(next(iter(self._envs))).close()
-            env = make_env(spec, self._settings.render_options)
+            env = self._settings.make_env(spec)
         self._envs[condition] = env  # the last one
         return env
 

@@ -12,6 +12,7 @@ from lerobot_bomb.libero.perturbations import LiberoCondition
 # Version of the axes and of how a policy is measured; records carry it.
 LIBERO_PROTOCOL_VERSION = "libero-1.0"
 TASKS_PER_SUITE = {suite: 90 if suite == "libero_90" else 10 for suite in SUITES}
+LIBERO_FPS = 20  # control steps a second, of its demonstrations and its environment
 MAX_ALLOWED_STEPS = 10_000
 STATE_DIM = 8  # the gripper's position, orientation as axis and angle, and its two fingers
 ACTION_DIM = 7
@@ -24,6 +25,10 @@ class LiberoFailure(StrEnum):
     NEVER_TOUCHED = "never_touched"  # the gripper met no object
     WRONG_OBJECT = "wrong_object"  # it met objects, none of those that the task is about
     UNFINISHED = "unfinished"
+    # of the scripted expert, whatever the gripper met
+    NO_GRASP = "no_grasp"  # none is free
+    NO_PLACE = "no_place"  # none that the goal accepts, and to which a grasp leads
+    NO_PATH = "no_path"  # of the gripper, between two of its poses
 
 
 @dataclass(frozen=True)

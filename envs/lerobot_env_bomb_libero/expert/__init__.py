@@ -1,0 +1,1 @@
+"""Planner of the scripted expert: where the gripper goes next, from the model's collision geometry."""
