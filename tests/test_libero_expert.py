@@ -1,6 +1,5 @@
 """The scripted expert of LIBERO: what it reads, which way it goes, what it refuses; without a simulator."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -70,7 +69,9 @@ def test_goals_open_first_and_close_last() -> None:
 def test_unknown_predicates_are_named(tmp_path: Path) -> None:
     path = tmp_path / "task.bddl"
     path.write_text(TASK.format("Stack"))
-    with pytest.raises(ValueError, match=r"task\.bddl: the expert does not know the predicate stack, only open"):
+    with pytest.raises(
+        ValueError, match=r"task\.bddl: the expert does not know the predicate stack, only open"
+    ):
         check_predicates(path)
     path.write_text(TASK.format("On"))
     check_predicates(path)
@@ -86,12 +87,17 @@ def test_every_task_asks_for_known_predicates(libero: Libero) -> None:
 @pytest.mark.parametrize(("flag", "value"), [("control_mode", "absolute"), ("fps", 10)])
 def test_other_controllers_are_refused(flag: str, value: str | int) -> None:
     config = make_env_config("bomb_libero", **{flag: value})
-    with acting(BombExpertConfig()), pytest.raises(ValueError, match=rf"--env\.{flag}={value}: the expert acts"):
+    with (
+        acting(BombExpertConfig()),
+        pytest.raises(ValueError, match=rf"--env\.{flag}={value}: the expert acts"),
+    ):
         config.get_env_processors()
 
 
 def test_expert_acts_on_seven_numbers() -> None:
-    policy = make_policy(make_policy_config("bomb_expert", device="cpu"), env_cfg=make_env_config("bomb_libero"))
+    policy = make_policy(
+        make_policy_config("bomb_expert", device="cpu"), env_cfg=make_env_config("bomb_libero")
+    )
     assert policy.config.output_features["action"].shape == (7,)  # pyright: ignore[reportOptionalSubscript]
 
 

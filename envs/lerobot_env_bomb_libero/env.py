@@ -87,9 +87,8 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
         self._is_guided = is_guided
         if is_guided:
             state = gymnasium.spaces.Box(-np.inf, np.inf, (LiberoState.DIM,), np.float32)
-            self.observation_space = gymnasium.spaces.Dict(
-                {**self._scene.observation_space.spaces, ENVIRONMENT_STATE: state}
-            )
+            shown: Any = self._scene.observation_space
+            self.observation_space = gymnasium.spaces.Dict({**shown.spaces, ENVIRONMENT_STATE: state})
 
     def _begin(self, spec: LiberoSpec) -> tuple[Observation, dict[str, Any]]:
         episode = sample_libero_episode(spec, self._instruction)

@@ -1,6 +1,7 @@
 """Episodes of LIBERO's scripted expert as those of a LeRobotDataset."""
 
 import json
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ def libero_episode(rollout: LiberoRollout) -> RecordedEpisode:
     columns = {
         "bomb/seed": spec.seed,
         "bomb/levels": json.dumps(rollout.result.levels),
-        "bomb/spec": json.dumps(spec.to_dict()),
+        "bomb/spec": json.dumps(asdict(spec)),
         "bomb/protocol_version": rollout.result.protocol_version,
         "bomb/package_version": __version__,
     }

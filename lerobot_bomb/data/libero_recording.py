@@ -16,7 +16,7 @@ from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE, PIXELS
 from lerobot_bomb.bomb.streams import recorder_noise
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.data.resumable import check_repo_id
-from lerobot_bomb.envs.rollout import run_episode
+from lerobot_bomb.envs.rollout import Agent, run_episode
 from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.libero.episode import LIBERO_PROTOCOL_VERSION, MOTION_DIMS, TASKS_PER_SUITE, LiberoSpec
 from lerobot_bomb.libero.expert import LiberoState, libero_expert_action
@@ -129,10 +129,10 @@ class LiberoRollouts:
     def make_env(self, spec: LiberoSpec) -> gymnasium.Env:
         return gymnasium.make(ENV_ID, disable_env_checker=True, spec=spec, scene=self.scene, is_guided=True)
 
-    def collect(self, env: gymnasium.Env, spec: LiberoSpec, agent: None = None) -> LiberoRollout:
-        """Run the expert in a spec's episode; the executed actions carry the noise."""
+    def collect(self, env: gymnasium.Env, spec: LiberoSpec, agent: Agent | None = None) -> LiberoRollout:
+        """Run the expert, or an agent, in a spec's episode; the executed actions carry the noise."""
         rng = recorder_noise(spec.seed)
-        moments = list(run_episode(env, spec, _act, disturb=partial(self._disturb, rng)))
+        moments = list(run_episode(env, spec, agent or _act, disturb=partial(self._disturb, rng)))
         result = env.get_wrapper_attr("episode_result")()
         shown = moments[:-1] if result.is_success else []
         return LiberoRollout(

@@ -51,7 +51,8 @@ class EpisodeSource:
 
     def rollouts(self, recording: AnyRecording, num_tried: int) -> RolloutPool | RelabelledRollouts:
         """Return the episodes of a recording after the first `num_tried`."""
-        settings, specs = self.settings(recording), recording.specs(num_tried)
+        settings = self.settings(recording)
+        specs: Iterator[Any] = recording.specs(num_tried)
         if self.behavior is None or not isinstance(settings, RolloutSettings):
             return RolloutPool(settings, specs, self.num_workers)
         return RelabelledRollouts(settings, specs, self.behavior.begin, self.behavior.agent)

@@ -1,3 +1,4 @@
+# pyright: reportAttributeAccessIssue=false
 """LIBERO's own view of a task: its goals, whether they hold, and what of a fixture moves."""
 
 from collections.abc import Sequence
