@@ -14,7 +14,7 @@ from lerobot_bomb.checkpoints.acting import acting
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.libero.assets import Libero
 from lerobot_bomb.libero.expert import LiberoState, libero_expert_action
-from lerobot_bomb.libero.goals import check_predicates, in_order
+from lerobot_bomb.libero.goals import check_predicates, expert_order
 from lerobot_env_mujoco.rotations import rotation
 from lerobot_policy_bomb_expert.configuration_bomb_expert import BombExpertConfig
 
@@ -63,7 +63,7 @@ def test_pending_motion_shortens_the_step() -> None:
 
 def test_goals_open_first_and_close_last() -> None:
     goals = [["close", "a"], ["in", "b", "a"], ["open", "a"]]
-    assert [goal[0] for goal in in_order(goals)] == ["open", "in", "close"]
+    assert [goal[0] for goal in expert_order(goals)] == ["open", "in", "close"]
 
 
 def test_unknown_predicates_are_named(tmp_path: Path) -> None:

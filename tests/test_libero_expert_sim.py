@@ -36,7 +36,7 @@ FLAGS = (
 def recorded(libero_with_assets: Libero, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Record an episode with noise, so with recoveries."""
     root = tmp_path_factory.mktemp("recorded") / "data"
-    flags = ["record", *FLAGS, "--repo_id=test/libero", "--episodes=1", "--images", "--noise=0.05"]
+    flags = ["record", *FLAGS, "--repo_id=test/libero", "--episodes=1", "--images", "--noise=0.1"]
     assert cli.main([*flags, f"--seed={SEED}", f"--root={root}"]) == 0
     return root
 

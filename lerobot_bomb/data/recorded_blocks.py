@@ -18,7 +18,7 @@ from lerobot_bomb.data.kept_blocks import Progress, episodes_before, reached
 from lerobot_bomb.data.libero_recording import LiberoRecording, LiberoRollout
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import add_block, block_episodes, missing_blocks
-from lerobot_bomb.data.rollout_pool import RelabelledRollouts, Rollout, RolloutPool, RolloutSettings, Settings
+from lerobot_bomb.data.rollout_pool import RelabelledRollouts, Rollout, RolloutPool, Rollouts, RolloutSettings
 from lerobot_bomb.envs.rollout import Agent, Expert
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class EpisodeSource:
             return RolloutPool(settings, specs, self.num_workers)
         return RelabelledRollouts(settings, specs, self.behavior.begin, self.behavior.agent)
 
-    def settings(self, recording: AnyRecording) -> Settings:
+    def settings(self, recording: AnyRecording) -> Rollouts:
         """Return how a recording's episodes are run."""
         if isinstance(recording, LiberoRecording):
             return recording.settings

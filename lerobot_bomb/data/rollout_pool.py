@@ -34,8 +34,8 @@ from lerobot_bomb.envs.rollout import Agent, Expert, add_noise, expert_agent, ma
 from lerobot_bomb.results.bomb import EpisodeResult
 
 
-class Settings(Protocol):
-    """Settings of rollouts; with a spec they determine one."""
+class Rollouts(Protocol):
+    """Settings of an environment's rollouts; with a spec they determine one."""
 
     max_envs: ClassVar[int]  # that a worker keeps; each holds an OpenGL context
 
@@ -190,7 +190,7 @@ class RolloutPool:
         RuntimeError: a worker has ended by itself.
     """
 
-    def __init__(self, settings: Settings, specs: Iterator[Any], num_workers: int) -> None:
+    def __init__(self, settings: Rollouts, specs: Iterator[Any], num_workers: int) -> None:
         context = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
         self._specs = specs
         self._processes: list[SpawnProcess] = []
@@ -242,7 +242,7 @@ class RolloutPool:
             pipe.send(next(self._specs))
 
 
-def _work(settings: Settings, pipe: Connection) -> None:
+def _work(settings: Rollouts, pipe: Connection) -> None:
     """Run a worker: receive specs, send rollouts or an exception, until the parent ends."""
     worker = _Worker(settings)
     with suppress(EOFError, ConnectionError):
@@ -254,7 +254,7 @@ def _work(settings: Settings, pipe: Connection) -> None:
 class _Worker:
     """Worker that keeps an environment of each of the last few conditions between episodes."""
 
-    def __init__(self, settings: Settings, agent: Agent | None = None) -> None:
+    def __init__(self, settings: Rollouts, agent: Agent | None = None) -> None:
         self._settings, self._agent = settings, agent
         self._envs: dict[Any, gymnasium.Env] = {}
 

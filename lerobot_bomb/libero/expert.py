@@ -13,7 +13,7 @@ PENDING = 0.35  # share of a command that the arm carries out in a step
 
 @dataclass(frozen=True)
 class LiberoState:
-    """What the expert reads of the simulator's true state and of its plan."""
+    """State that the expert reads: the simulator's, and the next pose of its plan."""
 
     gripper_xyz: np.ndarray  # (3,) metres
     gripper_mat: np.ndarray  # (3, 3) rotation

@@ -39,6 +39,6 @@ def check_predicates(path: Path) -> None:
         )
 
 
-def in_order(goals: Sequence[Sequence[str]]) -> list[Sequence[str]]:
+def expert_order(goals: Sequence[Sequence[str]]) -> list[Sequence[str]]:
     """Return goals in the order in which the expert reaches them."""
     return sorted(goals, key=lambda goal: ORDER.index(goal[0]))

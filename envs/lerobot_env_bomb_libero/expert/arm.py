@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_env_bomb_libero.expert.task import Task
+from lerobot_env_bomb_libero.expert.task import LiberoTask
 from lerobot_env_bomb_libero.scene import ROBOT_PREFIXES, LiberoScene
 from lerobot_env_bomb_libero.stock import mujoco
 
@@ -66,7 +66,7 @@ class Arm:
     """A copy of the scene's model and state; nothing done here changes the scene."""
 
     def __init__(self, scene: LiberoScene):
-        self.scene, self.task = scene, Task(scene)
+        self.scene, self.task = scene, LiberoTask(scene)
         self.model = copy(scene.model)
         self.data = mujoco.MjData(self.model)
         bodies = [self.model.body(body).name for body in range(self.model.nbody)]

@@ -10,12 +10,12 @@ import numpy as np
 
 from lerobot_bomb.libero.episode import LiberoFailure
 from lerobot_bomb.libero.expert import MAX_MOTION_M, MAX_TURN_RAD, OPEN, LiberoState
-from lerobot_bomb.libero.goals import in_order
+from lerobot_bomb.libero.goals import expert_order
 from lerobot_env_bomb_libero.expert.arm import Arm
-from lerobot_env_bomb_libero.expert.motion import PASSING, LostError, Motion, NoPlanError, Target
+from lerobot_env_bomb_libero.expert.motion import PASSING, LostError, Motion, NextPose, NoPlanError
 from lerobot_env_bomb_libero.expert.objects import carry, choose_grasp, drag
 from lerobot_env_bomb_libero.expert.parts import turn
-from lerobot_env_bomb_libero.expert.places import places_of
+from lerobot_env_bomb_libero.expert.places import resting_places
 from lerobot_env_bomb_libero.scene import LiberoScene
 
 HOME_M = 0.05  # nearer to where it began, the gripper is not drawn back for another plan
@@ -41,7 +41,7 @@ class Guide:
             MAX_MOTION_M * pending[:3], MAX_TURN_RAD * pending[3:],
         )  # fmt: skip
 
-    def _plan(self) -> Iterator[Target]:
+    def _plan(self) -> Iterator[NextPose]:
         motion = self._motion
         while self.failure is None:
             try:
@@ -52,22 +52,22 @@ class Guide:
                 if np.linalg.norm(motion.grip.xyz - self._home.xyz) < HOME_M:
                     self.failure = error.failure
                 yield from motion.go(self._home, OPEN, PASSING)
-            yield Target(motion.grip, OPEN)
+            yield NextPose(motion.grip, OPEN)
         while True:
-            yield Target(motion.grip, OPEN)
+            yield NextPose(motion.grip, OPEN)
 
-    def _reach_next(self) -> Iterator[Target]:
+    def _reach_next(self) -> Iterator[NextPose]:
         """Reach the first goal that does not hold."""
         task = self._motion.task
-        goal = next((each for each in in_order(task.goals) if not task.holds(each)), None)
+        goal = next((each for each in expert_order(task.goals) if not task.holds(each)), None)
         if goal is not None:
             yield from self._put(goal) if goal[0] in ("on", "in") else turn(self._motion, goal)
 
-    def _put(self, goal: Sequence[str]) -> Iterator[Target]:
+    def _put(self, goal: Sequence[str]) -> Iterator[NextPose]:
         """Put an object where a goal wants it, or open first what it goes into."""
         motion, arm = self._motion, self._motion.arm
         body = arm.scene.movable[goal[1]]
-        places = places_of(arm, goal, body)
+        places = resting_places(arm, goal, body)
         if not places:
             opening = motion.task.opening_of(goal[2])
             if opening is None or motion.task.holds(opening):

@@ -37,8 +37,8 @@ class LostError(Exception):
 
 
 @dataclass(frozen=True)
-class Target:
-    """Where the gripper goes now."""
+class NextPose:
+    """Pose that the gripper goes to now."""
 
     pose: Pose
     gripper: float  # command, -1 to open
@@ -59,7 +59,7 @@ class Motion:
 
     def go(
         self, pose: Pose, gripper: float, tolerance: tuple[float, float], speed: float = 1.0
-    ) -> Iterator[Target]:
+    ) -> Iterator[NextPose]:
         """Go straight, until the gripper is there or comes no nearer."""
         best, since = np.inf, 0
         for _ in range(MAX_STEPS):
@@ -72,9 +72,9 @@ class Motion:
             best, since = (left, 0) if left < best - PROGRESS_M else (best, since + 1)
             if since > SETTLED_STEPS:
                 return
-            yield Target(pose, gripper, speed)
+            yield NextPose(pose, gripper, speed)
 
-    def go_along(self, pose: Pose, held: Held | None, gripper: float) -> Iterator[Target]:
+    def go_along(self, pose: Pose, held: Held | None, gripper: float) -> Iterator[NextPose]:
         """Go by a free path.
 
         Raises:
@@ -86,7 +86,7 @@ class Motion:
         for corner in corners:
             yield from self.go(corner, gripper, PASSING)
 
-    def take(self, grasp: Grasp, geoms: Sequence[int]) -> Iterator[Target]:
+    def take(self, grasp: Grasp, geoms: Sequence[int]) -> Iterator[NextPose]:
         """Go to a grasp and close the gripper.
 
         Raises:
@@ -98,19 +98,19 @@ class Motion:
         for step in range(CLOSE_STEPS[1]):
             if step >= CLOSE_STEPS[0] and self.task.is_gripped(geoms):
                 break
-            yield Target(grasp.pose, CLOSE)
+            yield NextPose(grasp.pose, CLOSE)
         if not self.task.is_gripped(geoms):
             yield from self.let_go()
             raise LostError
 
-    def let_go(self) -> Iterator[Target]:
+    def let_go(self) -> Iterator[NextPose]:
         """Open the gripper and draw it back."""
         here = self.grip
         for _ in range(OPEN_STEPS):
-            yield Target(here, OPEN)
+            yield NextPose(here, OPEN)
         yield from self.go(here.shifted(-BACK_M * here.mat[:, 2]), OPEN, PASSING)
 
-    def while_held(self, targets: Iterator[Target], geoms: Sequence[int]) -> Iterator[Target]:
+    def while_held(self, targets: Iterator[NextPose], geoms: Sequence[int]) -> Iterator[NextPose]:
         """Pass targets on while both fingers touch these geoms.
 
         Raises:

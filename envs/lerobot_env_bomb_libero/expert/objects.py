@@ -19,8 +19,8 @@ from lerobot_env_bomb_libero.expert.motion import (
     UP,
     LostError,
     Motion,
+    NextPose,
     NoPlanError,
-    Target,
     tilted,
 )
 from lerobot_env_bomb_libero.expert.paths import find_path, is_free_way
@@ -88,7 +88,7 @@ def _gripper_at(motion: Motion, held: Held, places: Sequence[Pose]) -> Pose | No
     return None
 
 
-def carry(motion: Motion, goal: Sequence[str], body: int, places: Sequence[Pose]) -> Iterator[Target]:
+def carry(motion: Motion, goal: Sequence[str], body: int, places: Sequence[Pose]) -> Iterator[NextPose]:
     """Carry what is held to a place, and let it go.
 
     Raises:
@@ -110,11 +110,11 @@ def carry(motion: Motion, goal: Sequence[str], body: int, places: Sequence[Pose]
         if motion.task.holds(goal):
             break
         pose = pose.shifted(-LOWER_M * UP)
-        yield Target(pose, CLOSE, 0.3)
+        yield NextPose(pose, CLOSE, 0.3)
     yield from motion.let_go()
 
 
-def drag(motion: Motion, goal: Sequence[str], body: int, place: Pose) -> Iterator[Target]:
+def drag(motion: Motion, goal: Sequence[str], body: int, place: Pose) -> Iterator[NextPose]:
     """Press on an object from above, and draw it along what it lies on.
 
     Raises:
@@ -136,7 +136,7 @@ def drag(motion: Motion, goal: Sequence[str], body: int, place: Pose) -> Iterato
             yield from motion.let_go()
             raise LostError
         ahead = motion.grip.xyz[:2] + left * min(1.0, AHEAD_M / left_m)
-        yield Target(Pose(np.array([*ahead, pressed.xyz[2]]), pressed.mat), CLOSE)
+        yield NextPose(Pose(np.array([*ahead, pressed.xyz[2]]), pressed.mat), CLOSE)
     yield from motion.let_go()
 
 

@@ -16,8 +16,8 @@ from lerobot_env_bomb_libero.expert.motion import (
     SETTLED_STEPS,
     LostError,
     Motion,
+    NextPose,
     NoPlanError,
-    Target,
     tilted,
 )
 from lerobot_env_bomb_libero.expert.surfaces import surface_of
@@ -36,7 +36,7 @@ SHARES = (0.5, 1.0)  # of the way of a part, where the arm is looked at
 
 
 @dataclass(frozen=True)
-class Part:
+class MovingPart:
     """A moving part of a fixture."""
 
     joint: int
@@ -55,7 +55,7 @@ class Part:
         return arm.body(self.body)
 
 
-def turn(motion: Motion, goal: Sequence[str], is_wide: bool = False) -> Iterator[Target]:
+def turn(motion: Motion, goal: Sequence[str], is_wide: bool = False) -> Iterator[NextPose]:
     """Move a fixture's part until a goal holds; `is_wide`: as far as its joint goes.
 
     Raises:
@@ -72,14 +72,14 @@ def turn(motion: Motion, goal: Sequence[str], is_wide: bool = False) -> Iterator
         raise LostError
 
 
-def part_of(arm: Arm, goal: Sequence[str], is_wide: bool) -> Part | None:
+def part_of(arm: Arm, goal: Sequence[str], is_wide: bool) -> MovingPart | None:
     """Return the part that a goal moves; None if no position of a joint fulfils it."""
     for name in arm.task.joints_of(goal[1]):
         joint = arm.model.joint(name).id
         target = _target(arm, goal, joint, is_wide)
         if target is not None:
             body = int(arm.model.jnt_bodyid[joint])
-            return Part(joint, body, target, _geoms_on(arm, body))
+            return MovingPart(joint, body, target, _geoms_on(arm, body))
     return None
 
 
@@ -109,7 +109,7 @@ def _geoms_on(arm: Arm, body: int) -> np.ndarray:
     return np.flatnonzero(is_on[model.geom_bodyid])
 
 
-def _choose_grasp(motion: Motion, part: Part) -> Grasp:
+def _choose_grasp(motion: Motion, part: MovingPart) -> Grasp:
     """Return the best free grasp with which the arm can follow the part; after a loss, another one."""
     arm, fitting = motion.arm, []
     arm.mirror()
@@ -135,7 +135,7 @@ def _choose_grasp(motion: Motion, part: Part) -> Grasp:
     raise NoPlanError(LiberoFailure.NO_GRASP)
 
 
-def _can_hold(arm: Arm, part: Part, position: float, pose: Pose) -> bool:
+def _can_hold(arm: Arm, part: MovingPart, position: float, pose: Pose) -> bool:
     """Return True if the arm is free at a pose, while the part is at a position."""
     arm.mirror()
     joints = arm.joints
@@ -147,7 +147,7 @@ def _can_hold(arm: Arm, part: Part, position: float, pose: Pose) -> bool:
     return arm.clearance_m(ignored=ignored) >= KEPT_M
 
 
-def _move(motion: Motion, part: Part) -> Iterator[Target]:
+def _move(motion: Motion, part: MovingPart) -> Iterator[NextPose]:
     """Move the gripper as the part moves, until the part is at its target or comes no nearer."""
     arm = motion.arm
     model, data = arm.scene.model, arm.scene.data
@@ -163,4 +163,4 @@ def _move(motion: Motion, part: Part) -> Iterator[Target]:
         best, since = (abs(left), 0) if abs(left) < best - PROGRESS * span else (best, since + 1)
         arm.mirror()
         step = float(np.clip(left, -LEAD * span, LEAD * span))
-        yield Target(part.pose_at(arm, now + step) @ in_part, CLOSE)
+        yield NextPose(part.pose_at(arm, now + step) @ in_part, CLOSE)

@@ -17,13 +17,13 @@ OVERLAP_M = -0.003
 STEEP = 0.6  # least downward share of the direction in which a gripper points, to come from above along it
 
 
-def between(start: Pose, end: Pose, step_m: float = STEP_M, step_rad: float = STEP_RAD) -> Iterator[Pose]:
+def straight_way(start: Pose, end: Pose) -> Iterator[Pose]:
     """Yield poses on the straight way, the end included."""
     turn = rotation_vector(end.mat @ start.mat.T)
     angle_rad = float(np.linalg.norm(turn))
     axis = turn / angle_rad if angle_rad > 1e-6 else np.array([0.0, 0.0, 1.0])
     way = end.xyz - start.xyz
-    count = max(1, int(np.ceil(max(np.linalg.norm(way) / step_m, angle_rad / step_rad))))
+    count = max(1, int(np.ceil(max(np.linalg.norm(way) / STEP_M, angle_rad / STEP_RAD))))
     for share in np.arange(1, count + 1) / count:
         yield Pose(start.xyz + share * way, rotation(axis, share * angle_rad) @ start.mat)
 
@@ -76,7 +76,7 @@ def _is_free(arm: Arm, corners: list[Pose], joints: np.ndarray, held: Held | Non
     arm.mirror()
     first, last = corners[0].xyz, corners[-1].xyz
     for one, other in pairwise(corners):
-        for pose in between(one, other):
+        for pose in straight_way(one, other):
             near_m = min(np.linalg.norm(pose.xyz - first), np.linalg.norm(pose.xyz - last))
             kept_m = OVERLAP_M if near_m < LEAVING_M else KEPT_M
             if not _is_free_at(arm, pose, joints, held, opening_m, kept_m):

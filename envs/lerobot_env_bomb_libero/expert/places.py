@@ -15,7 +15,7 @@ MAX_OVERLAP_M = 0.02
 TURNS_RAD = tuple(np.radians([0, 30, -30, 60, -60, 90, -90, 135, -135, 180]).tolist())
 
 
-def places_of(arm: Arm, goal: Sequence[str], body: int) -> list[Pose]:
+def resting_places(arm: Arm, goal: Sequence[str], body: int) -> list[Pose]:
     """Return poses in which an object rests and the goal holds, the middle ones first."""
     arm.mirror()
     upright = arm.body(body).mat

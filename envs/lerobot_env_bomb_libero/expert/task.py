@@ -15,7 +15,7 @@ FINGER_BODIES = (
 )
 
 
-class Task:
+class LiberoTask:
     """A task in a scene that has been reset."""
 
     def __init__(self, scene: LiberoScene):
