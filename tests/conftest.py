@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from kept_work import check_numbers_once, keep_distributions, keep_flags, look_at_columns_once
 from recipes import POLICY_TYPES
 from variants import variants_of
 
 if TYPE_CHECKING:
     from pusht_cases import Demonstrations
 
+    from lerobot_bomb.bomb.episode import EpisodeSpec
     from lerobot_bomb.libero.assets import Libero
 
 # by CPU time; begun first, none of them is what a run waits for in the end
@@ -130,13 +132,32 @@ def pusht_dataset(pusht_zarr: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.fixture(scope="session", autouse=True)
-def kept_help() -> Iterator[None]:
-    """LeRobot's parser takes half a second to find all flags' help in sources, anew for each command."""
-    from draccus.wrappers import docstring
-
-    kept = functools.cache(docstring.get_attribute_docstring)
+def kept_work() -> Iterator[None]:
+    """Let commands find what others before them have worked out."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(docstring, "get_attribute_docstring", kept)
+        keep_flags(patch)
+        keep_distributions(patch)
+        if "lerobot" in sys.modules:  # importing it takes seconds, and many tests do without
+            look_at_columns_once(patch)
+            check_numbers_once(patch)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def recorded_here() -> Iterator[None]:
+    """Run the episodes of a recording with one worker in this process: a worker's start takes longer."""
+    from lerobot_bomb.data import recorded_blocks
+    from lerobot_bomb.data.rollout_pool import RolloutPool, RolloutSettings, RolloutsHere
+
+    def rollouts(
+        settings: RolloutSettings, specs: "Iterator[EpisodeSpec]", num_workers: int
+    ) -> RolloutPool | RolloutsHere:
+        if num_workers == 1:
+            return RolloutsHere(settings, specs)
+        return RolloutPool(settings, specs, num_workers)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recorded_blocks, "RolloutPool", rollouts)
         yield
 
 
