@@ -144,6 +144,24 @@ def kept_work() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def small_pictures() -> Iterator[int | None]:
+    """Draw small what is drawn for people alone, which takes longer than all else; yield the usual size."""
+    env: Any = sys.modules.get("lerobot_env_bomb.env")
+    with pytest.MonkeyPatch.context() as patch:
+        usual = getattr(env, "PERSON_IMAGE_SIZE", None)
+        if env is not None:
+            patch.setattr(env, "PERSON_IMAGE_SIZE", 96)
+        yield usual
+
+
+@pytest.fixture
+def usual_pictures(small_pictures: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw for people as large as users see it."""
+    if small_pictures is not None:
+        monkeypatch.setattr("lerobot_env_bomb.env.PERSON_IMAGE_SIZE", small_pictures)
+
+
+@pytest.fixture(scope="session", autouse=True)
 def recorded_here() -> Iterator[None]:
     """Run the episodes of a recording with one worker in this process: a worker's start takes longer."""
     from lerobot_bomb.data import recorded_blocks

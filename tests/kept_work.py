@@ -26,10 +26,10 @@ def keep_flags(patch: pytest.MonkeyPatch) -> None:
 
 def keep_distributions(patch: pytest.MonkeyPatch) -> None:
     """Keep the metadata of installed packages, among which LeRobot looks for plugins."""
-    distributions, read = metadata.distributions, metadata.Distribution.metadata.fget
+    distributions, text = metadata.distributions, vars(metadata.Distribution)["metadata"]
     found = functools.cache(lambda _: list(distributions()))
     patch.setattr(metadata, "distributions", lambda: found(tuple(sys.path)))
-    patch.setattr(metadata.Distribution, "metadata", property(functools.cache(read)))
+    patch.setattr(metadata.Distribution, "metadata", property(functools.cache(text.fget)))
 
 
 def look_at_columns_once(patch: pytest.MonkeyPatch) -> None:

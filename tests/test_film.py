@@ -42,6 +42,7 @@ def test_marks_are_drawn_where_they_belong() -> None:
     assert (xs.mean(), ys.mean()) == (pytest.approx(130, abs=3), pytest.approx(130, abs=4))
 
 
+@pytest.mark.usefixtures("usual_pictures")
 def test_the_ring_is_where_the_target_is_and_lines_are_numbered() -> None:
     env = make_env(SPEC, OPTIONS)
     *_, last = run_episode(env, SPEC, expert_agent())
