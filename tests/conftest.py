@@ -25,10 +25,11 @@ if TYPE_CHECKING:
 SLOWEST_FILES = (
     "test_long",
     "test_parity",
+    "test_explain_command",
+    "test_record_kill",
+    "test_parts",
     "test_replay",
     "test_record",
-    "test_record_kill",
-    "test_explain_command",
     "test_bomb_libero_env",
     "test_shipped",
     "test_sweep",

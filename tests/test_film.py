@@ -77,6 +77,7 @@ def test_the_moment_in_the_middle_is_the_first_grasp_if_there_is_one(agent: Agen
     assert film.moments == {"start": 0, f"{name}, step {step}": step, f"end, step {last}": last}
 
 
+@pytest.mark.usefixtures("usual_pictures")
 def test_a_video_and_its_film_come_from_one_run(tmp_path: Any) -> None:
     run = viewed_run(expert_agent())
     rrd, mp4 = tmp_path / "x.rrd", tmp_path / "x.mp4"
