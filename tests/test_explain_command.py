@@ -13,7 +13,7 @@ from lerobot_bomb.commands.main import main
 @pytest.mark.one_type
 def test_one_episode(policy_type: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "why"
-    flags = [f"--policy.path=bomb:{policy_type}", "--seed=100000", "--grid=4", f"--output={output}"]
+    flags = [f"--policy.path=bomb:{policy_type}", "--seed=100000", "--grid=2", f"--output={output}"]
     assert main(["explain", *flags]) == 0
     printed = capsys.readouterr().out
     assert {path.name for path in output.iterdir()} == {
@@ -26,11 +26,11 @@ def test_one_episode(policy_type: str, tmp_path: Path, capsys: pytest.CaptureFix
     assert phases == ["reach", "grasp", "carry", "place"]
     assert "\n".join(found["verdict"]) in printed and "It succeeded after" in found["verdict"][0]
     for moment in found["moments"]:
-        assert {len(grid) for grid in moment["patches"].values()} == {4}
+        assert {len(grid) for grid in moment["patches"].values()} == {2}
         assert moment["words"]["row and column"] is not None
         assert {len(each["mlps"]) for each in moment["restored"]} == {2}
         assert "pointing" not in moment and "It points at:" not in moment["findings"]
-        assert {len(grid) for grid in moment["moved_mm"]["patches"].values()} == {4}
+        assert {len(grid) for grid in moment["moved_mm"]["patches"].values()} == {2}
         assert moment["moved_mm"]["objects"].keys() == moment["objects"].keys()
     page = (output / "explanation.html").read_text()
     # the maps, and the filmstrip

@@ -42,6 +42,7 @@ def test_marks_are_drawn_where_they_belong() -> None:
     assert (xs.mean(), ys.mean()) == (pytest.approx(130, abs=3), pytest.approx(130, abs=4))
 
 
+@pytest.mark.usefixtures("usual_pictures")
 def test_the_ring_is_where_the_target_is_and_lines_are_numbered() -> None:
     env = make_env(SPEC, OPTIONS)
     *_, last = run_episode(env, SPEC, expert_agent())
@@ -76,6 +77,7 @@ def test_the_moment_in_the_middle_is_the_first_grasp_if_there_is_one(agent: Agen
     assert film.moments == {"start": 0, f"{name}, step {step}": step, f"end, step {last}": last}
 
 
+@pytest.mark.usefixtures("usual_pictures")
 def test_a_video_and_its_film_come_from_one_run(tmp_path: Any) -> None:
     run = viewed_run(expert_agent())
     rrd, mp4 = tmp_path / "x.rrd", tmp_path / "x.mp4"

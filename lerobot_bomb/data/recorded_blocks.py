@@ -17,7 +17,7 @@ from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.data.kept_blocks import Progress, episodes_before, reached
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import add_block, block_episodes, missing_blocks
-from lerobot_bomb.data.rollout_pool import RelabelledRollouts, Rollout, RolloutPool, RolloutSettings
+from lerobot_bomb.data.rollout_pool import Rollout, RolloutPool, RolloutSettings, RolloutsHere
 from lerobot_bomb.envs.rollout import Agent, Expert, make_env
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class EpisodeSource:
     expert: Expert = expert_action
     behavior: BehaviorPolicy | None = None  # the expert says what it would have done
 
-    def rollouts(self, recording: Recording, num_tried: int) -> RolloutPool | RelabelledRollouts:
+    def rollouts(self, recording: Recording, num_tried: int) -> RolloutPool | RolloutsHere:
         """Return the episodes of a recording after the first `num_tried`."""
         settings = RolloutSettings(
             recording.render_options,
@@ -57,7 +57,7 @@ class EpisodeSource:
         specs = recording.specs(num_tried)
         if self.behavior is None:
             return RolloutPool(settings, specs, self.num_workers)
-        return RelabelledRollouts(settings, specs, self.behavior.begin, self.behavior.agent)
+        return RolloutsHere(settings, specs, self.behavior.begin, self.behavior.agent)
 
 
 def record_blocks(
