@@ -52,7 +52,6 @@ register(
         lambda: tell_wrong_flags(hint, refuse_unknown),
         lambda: explain_missing_datasets(describe_missing_dataset),
         lambda: keep_frames_in_memory(keep_frames),
-
         lambda: check_evaluations(complete_evaluation),
         lambda: check_tokens_before_use(check_token_characters),
         publish_as_the_policy_says,
