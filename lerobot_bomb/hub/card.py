@@ -69,7 +69,7 @@ class Checkpoint:
         return PolicyCard(f"---\n{self._metadata().to_yaml()}\n---\n\n{self._text()}")
 
     def figure(self) -> bytes | None:
-        """Return the PNG that the card shows; None if it has no rates."""
+        """Return the SVG that the card shows; None if it has no rates."""
         return figure(self._groups) if self.results else None
 
     @cached_property
@@ -145,7 +145,7 @@ class Checkpoint:
             f"A checkpoint of LeRobot's policy type `{self.config.type}`, which the plugin "
             f"`lerobot_policy_bomb` adds{self._size()}. {self._weights()}{benchmark}",
             *(f"Success on {headline(group)}" for group in self._groups),
-            *([f"![Success rate by condition, as in the table below]({FIGURE})"] if self._groups else []),
+            *([f"![Success by condition, as in the table below]({FIGURE})"] if self._groups else []),
             f"The policy type: {self.method.summary}{self._methods_used()}",
         ]
         return "\n\n".join(paragraphs)
