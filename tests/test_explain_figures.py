@@ -73,7 +73,7 @@ def test_maps_end_where_the_verdict_ends() -> None:
     assert re.findall(r"at most ([\d.]+ mm)", html) == ["2.0 mm", "4.0 mm", "1.0 mm", "2.0 mm"]
     (first, *_) = images_of(html)
     assert first[0, 0].tolist() == tint(2.0, 20.0, 100) and first[-1, -1].tolist() == [100] * 3
-    assert f"{round(STRENGTH * 3 / 20, 3)})" in html  # the word "Place"
+    assert f"{round(STRENGTH * (3 / 20), 3)})" in html  # the word "Place"
 
 
 def test_heads_are_drawn_in_the_scale_of_the_maps() -> None:

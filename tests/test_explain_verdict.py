@@ -245,8 +245,8 @@ WRONG = result("wrong_intersection")
     [
         (
             {"object: gripper": result("imprecise", **AT_TARGET)},
-            ["With the gripper hidden in every step, the stone goes to the right intersection, row 4, "
-             "column 2, not to row 3, column 2."],
+            ["With the gripper hidden in every step, the stone is put down at the right intersection, row 4, "
+             "column 2, not at row 3, column 2."],
         ),
         (
             {
@@ -258,8 +258,8 @@ WRONG = result("wrong_intersection")
             [
                 "With the gripper or the words for row and column hidden, or another colour named, in every "
                 "step, it succeeds.",
-                "With another row named in every step, the stone goes to the right intersection, row 4, "
-                "column 2, not to row 3, column 2.",
+                "With another row named in every step, the stone is put down at the right intersection, row "
+                "4, column 2, not at row 3, column 2.",
             ],
         ),
         # not put down there: the stone lay there all the time, or was let fall
@@ -273,6 +273,15 @@ def test_a_change_that_turns_a_failure_right_comes_first(masked: dict[str, Any],
     found = verdict([episode])
     assert found[: len(told)] == told and found[len(told)].startswith("It failed (wrong_intersection)")
     assert ("Whatever single input" in " ".join(found)) is not bool(told)
+
+
+def test_a_stone_that_was_never_put_down_is_put_down_right() -> None:
+    held, put = result("timeout_holding", **AT_TARGET), result("imprecise", **AT_TARGET)
+    masked = {"nothing": held, "object: stone": put}
+    assert verdict([{"result": held, "moments": [moment()], "masked_episodes": masked}])[0] == (
+        "With the stone hidden in every step, the stone is put down at the right intersection, row 4, "
+        "column 2."
+    )
 
 
 def test_a_success_needs_no_other_words() -> None:

@@ -108,8 +108,10 @@ def turned_right(result: Values, masked: Mapping[str, Values]) -> list[str]:
     succeeded, right = turning(result, masked)
     told = [f"With {_changes(succeeded)} in every step, it succeeds."] if succeeded else []
     if right:
-        there, instead = (_intersection(each["nearest_intersection"]) for each in (masked[right[0]], result))
-        where = f"the stone goes to the right intersection, {there}, not to {instead}"
+        there = _intersection(result["target"])
+        where = f"the stone is put down at the right intersection, {there}"
+        if result["failure"] in PUT_DOWN:
+            where += f", not at {_intersection(result['nearest_intersection'])}"
         told.append(f"With {_changes(right)} in every step, {where}.")
     return told
 

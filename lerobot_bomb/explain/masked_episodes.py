@@ -74,7 +74,7 @@ def without_words(loaded: LoadedPolicy, words: Callable[[str], Span | None]) -> 
     return Mask(change_prepared=hide)
 
 
-def reworded(others: Mapping[str, str]) -> Mask:
+def with_other_words(others: Mapping[str, str]) -> Mask:
     """Give the policy other instructions; ``others``: instruction -> the one in its place."""
 
     def change(batch: Batch, _: gymnasium.Env) -> Batch:
@@ -96,7 +96,7 @@ def masks_of(snapshot: Snapshot, loaded: LoadedPolicy, fill: str) -> dict[str, M
             masks[mask_name(HIDDEN_WORDS, span.name)] = without_words(loaded, by_instruction.get)
         masks[WHOLE] = without_words(loaded, whole)
         for word, other in snapshot.instructions.items():
-            masks[mask_name(ANOTHER, word)] = reworded({snapshot.instruction: other})
+            masks[mask_name(ANOTHER, word)] = with_other_words({snapshot.instruction: other})
     return masks
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.hub.markdown import code, plain
-from lerobot_bomb.report.chart import standalone
+from lerobot_bomb.report.chart import Chart
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.sections import answer
 from lerobot_bomb.results.groups import Group, by_condition, rate_of
@@ -38,10 +38,10 @@ def headline(group: Group) -> str:
     return f"{plain(_title(group))}: {'; '.join(parts)} ({methods})."
 
 
-def figure(groups: Sequence[Group]) -> bytes:
-    """Draw the report's figure of each condition's rate with its interval, as an SVG file."""
+def rates_chart(groups: Sequence[Group]) -> Chart:
+    """Return the report's chart of each condition's rate with its interval."""
     (chart,) = answer.section(Report([*groups])).charts
-    return standalone(chart.svg).encode()
+    return chart
 
 
 def results_table(group: Group) -> str:

@@ -128,10 +128,11 @@ def _mean_map(
 def following_charts(by_phase: ByPhase) -> Iterator[Chart]:
     """Yield a chart of how far the next actions follow other instructions, where those name other targets."""
     title = "Told to go elsewhere: how far do the next actions follow?"
-    words = {
-        phase: dict.fromkeys(w for each in of for w in each.followings) for phase, of in by_phase.items()
+    shown = {
+        phase: names
+        for phase, moments in by_phase.items()
+        if (names := [*dict.fromkeys(word for each in moments for word in each.followings)])
     }
-    shown = {phase: [*names] for phase, names in words.items() if names}
     if not shown:
         return
 
@@ -175,7 +176,7 @@ def pointing_charts(by_phase: ByPhase) -> Iterator[Chart]:
         for phase, found in shares.items()
         for name, mean in found.items()
     ]
-    table = Table("", ["phase", "", "share"], rows)
+    table = Table("", ["phase", "what", "share"], rows)
     yield Chart(title, dot_chart(title, [], blocks), [table], f"{MEANS_NOTE} {POINTING_NOTE}")
 
 

@@ -125,7 +125,7 @@ def _restored(restored: PatchingResult) -> list[Table]:
         [Cell(name), *map(_ratio, heads), _ratio(mlp)]
         for name, heads, mlp in zip(layers, restored.heads, restored.mlps, strict=True)
     ]
-    header = ["", *(f"head {head}" for head in range(num_heads)), "MLP"]
+    header = ["layer", *(f"head {head}" for head in range(num_heads)), "MLP"]
     return [*tables, Table(f"{title}; heads and MLPs", header, rows, note)]
 
 

@@ -36,7 +36,7 @@ def pointing_tables(check: PointingCheck) -> Iterator[Table]:
         held = [Cell(f"{share:.2f}", share) for share in (pointed.held, meant.held)]
         rows.insert(2, [Cell("held"), *held, Cell("-")])
     note = f"It points at {check.finding.answer}. {NOTE}"
-    yield Table("What it points at", ["", "policy", "meant", "apart, mm"], rows, note)
+    yield Table("What it points at", ["what", "policy", "meant", "apart, mm"], rows, note)
     likeliest = pointed.likeliest[:NUM_PLACES]
     if likeliest:
         places = [
@@ -88,7 +88,7 @@ def mean_pointing(moments: Sequence[ExplainedMoment]) -> Iterator[Table]:
     }
     rows = [[Cell(name), mean_cell(mean, ".2f")] for name, mean in mean_shares(moments).items()]
     rows += [[Cell(name), mean_cell(mean_of(values), ".1f")] for name, values in distances.items()]
-    yield Table("What it points at", ["", "share or mean"], rows, NOTE)
+    yield Table("What it points at", ["what", "share or mean"], rows, NOTE)
 
 
 def _millimetres(value: float) -> Cell:

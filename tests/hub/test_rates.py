@@ -10,7 +10,7 @@ from bomb_pusht_cases import pusht_row
 from result_rows import read, values
 
 from lerobot_bomb.hub.evaluations import model_index
-from lerobot_bomb.hub.rates import figure, headline, mostly_failing, rates_of
+from lerobot_bomb.hub.rates import headline, mostly_failing, rates_chart, rates_of
 from lerobot_bomb.report.chart import standalone
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.sections import answer
@@ -76,7 +76,7 @@ def dots(svg: str) -> list[tuple[float, float]]:
 
 
 def test_the_figure_has_a_dot_where_each_rate_is() -> None:
-    svg = figure([group(none=(10, 10), light_3=(5, 10), camera_3=(0, 10))]).decode()
+    svg = rates_chart([group(none=(10, 10), light_3=(5, 10), camera_3=(0, 10))]).svg
     (all_of_them, _), (none, _), (half, _) = dots(svg)
     assert none < half < all_of_them and half - none == pytest.approx(all_of_them - half, abs=0.1)
     names = [svg.index(f">{name}<") for name in ("unperturbed", "camera:3", "light:3")]
@@ -86,9 +86,8 @@ def test_the_figure_has_a_dot_where_each_rate_is() -> None:
 def test_the_figure_of_a_card_is_that_of_a_report() -> None:
     groups = [group(none=(9, 10), camera_3=(2, 10))]
     (chart,) = answer.section(Report(groups)).charts
-    drawn = figure(groups).decode()
-    assert drawn == standalone(chart.svg)
-    assert ElementTree.fromstring(drawn).tag == "{http://www.w3.org/2000/svg}svg"
+    assert rates_chart(groups) == chart
+    assert ElementTree.fromstring(standalone(chart.svg)).tag == "{http://www.w3.org/2000/svg}svg"
 
 
 def test_the_metadata_has_a_name_without_numbers_and_the_counts_beside_it() -> None:
