@@ -17,7 +17,7 @@ def is_hidden(mask: str) -> bool:
 def subject(mask: str) -> str:
     """Return "the stone", "the word for row", "another colour"."""
     kind, _, name = mask.partition(": ")
-    told = {OBJECT: f"the {name}", HIDDEN_WORDS: word_name(name), ANOTHER: f"another {_british(name)}"}
+    told = {OBJECT: f"the {name}", HIDDEN_WORDS: word_name(name), ANOTHER: f"another {british(name)}"}
     return told.get(kind, mask)
 
 
@@ -30,8 +30,9 @@ def word_name(name: str) -> str:
     """Return "the word for row", "the words for row and column", 'the word "black"'."""
     if name.startswith('"'):
         return f"the word {name}"
-    return f"the word{'s' if ' and ' in name else ''} for {_british(name)}"
+    return f"the word{'s' if ' and ' in name else ''} for {british(name)}"
 
 
-def _british(name: str) -> str:
+def british(name: str) -> str:
+    """Spell a word of an instruction, such as "color", as sentences do."""
     return name.replace("color", "colour")

@@ -10,6 +10,7 @@ from lerobot_bomb.explain.aggregate import Mean, mean_of
 from lerobot_bomb.explain.effects import OBJECTS, WORDS, Effect, Values, effects_in_phase
 from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.maps import data_url, tinted
+from lerobot_bomb.explain.mask_names import ANOTHER, british, mask_name, subject
 from lerobot_bomb.explain.moment_query import camera_name
 from lerobot_bomb.explain.probes import LayerProbe
 from lerobot_bomb.report.cells import mean_cell
@@ -78,7 +79,7 @@ def effects_chart(by_phase: Mapping[str, Sequence[Values]]) -> Chart:
 
 
 def _label(effect: Effect) -> str:
-    return f"words: {effect.name}" if effect.kind == WORDS else effect.name
+    return f"words: {british(effect.name)}" if effect.kind == WORDS else effect.name
 
 
 def _mean_maps(moments: Sequence[ExplainedMoment]) -> dict[str, np.ndarray]:
@@ -143,7 +144,7 @@ def following_charts(by_phase: ByPhase) -> Iterator[Chart]:
     blocks = [
         Block(
             phase or MIDDLE,
-            [f"another {word.replace('color', 'colour')}" for word in names],
+            [subject(mask_name(ANOTHER, word)) for word in names],
             [_column("mm", [[mean(phase, word, name) for word in names] for name in FOLLOWING])],
         )
         for phase, names in shown.items()
