@@ -13,7 +13,7 @@ from lerobot_bomb.checkpoints.config import config_damage
 from lerobot_bomb.checkpoints.environment import complete_evaluation
 from lerobot_bomb.checkpoints.names import is_hub_id
 from lerobot_bomb.checkpoints.processor_files import check_saved_processors
-from lerobot_bomb.checkpoints.shipped import PREFIX, checkpoint_path
+from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.compat.hooks.datasets import explain_missing_datasets, keep_frames_in_memory
 from lerobot_bomb.compat.hooks.errors import tell_config_errors, tell_refusals
 from lerobot_bomb.compat.hooks.evaluation import check_evaluations
@@ -27,6 +27,7 @@ from lerobot_bomb.data.hub_token import check_token_characters
 from lerobot_bomb.data.kept_frames import keep_frames
 from lerobot_bomb.data.missing import describe_missing_dataset
 from lerobot_bomb.flag_errors import hint, refuse_unknown
+from lerobot_bomb.results.names import SHIPPED_PREFIX
 
 OURS = (
     lerobot_bomb,
@@ -41,7 +42,7 @@ OURS = (
 )
 SHARED = "lerobot_env_mujoco"  # our package with which environments draw; it has no type
 
-resolve_checkpoints(PREFIX, checkpoint_path)
+resolve_checkpoints(SHIPPED_PREFIX, checkpoint_path)
 register(
     [*(package.__name__ for package in OURS), SHARED],
     [
