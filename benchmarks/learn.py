@@ -223,6 +223,11 @@ def record(task: Task, demonstrations: int, dataset: Path) -> None:
     for part, folder in zip(task.parts, folders, strict=True):
         if not folder.exists():
             run_record(task, folder, part, "--pointing")
+    merge(folders, dataset)
+
+
+def merge(folders: Sequence[Path], dataset: Path) -> None:
+    """Merge recordings into one dataset."""
     run_command(
         "lerobot-bomb", "record", "merge", *map(str, folders), f"--repo_id={REPO_ID}", f"--root={dataset}"
     )

@@ -10,6 +10,7 @@ decodes an image when it is first asked for, and then keeps it.
 import random
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
@@ -45,9 +46,10 @@ def main() -> None:
     ours = LeRobotDataset(args.repo_id, args.root, delta_timestamps=times)
     rows = random.Random(0).sample(range(len(stock)), min(args.samples, len(stock)))
     loading = milliseconds(lambda: ours[rows[0]], time.process_time)
-    samples, figures = [], {}
+    samples: list[list[Any]] = []
+    figures = {}
     for name, dataset in (("LeRobot", stock), ("plugin, decodes", ours), ("plugin, again", ours)):
-        read: list[dict] = []
+        read: list[Any] = []
         spent = milliseconds(
             lambda dataset=dataset, read=read: read.extend(dataset[row] for row in rows), time.process_time
         )

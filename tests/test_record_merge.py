@@ -1,6 +1,8 @@
 """`lerobot-bomb record merge` gives the frames and statistics of LeRobot's own merge."""
 
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,18 +16,22 @@ from lerobot_bomb.commands.main import main
 REPO_ID = "test/merged"
 
 
+def numbers(scale: int, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a state and an action of a frame."""
+    return np.array([scale * frame], np.float32), np.array([scale, 2 * frame], np.float32)
+
+
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Write two datasets of other values and lengths."""
     folder = tmp_path_factory.mktemp("data")
     for scale in (1, 3):
-        numbers = [np.float32([scale]), np.float32([scale, 2])]
-        write_dataset(
-            folder / str(scale),
-            lambda frame, numbers=numbers: tuple(value * frame for value in numbers),
-            num_frames=4 + scale,
-        )
+        write_dataset(folder / str(scale), partial(numbers, scale), num_frames=4 + scale)
     return [folder / "1", folder / "3"]
+
+
+def read(root: Path) -> Any:
+    return LeRobotDataset(REPO_ID, root)
 
 
 def merge(folders: list[Path], root: Path) -> int:
@@ -40,7 +46,7 @@ def test_the_dataset_equals_what_lerobot_merges(
     assert capsys.readouterr().out.startswith("4 episodes, 24 frames: ")
     assert [path.name for path in tmp_path.iterdir()] == ["ours"]
     aggregate_datasets([REPO_ID] * 2, REPO_ID, roots=folders, aggr_root=tmp_path / "theirs")
-    ours, theirs = (LeRobotDataset(REPO_ID, tmp_path / name) for name in ("ours", "theirs"))
+    ours, theirs = (read(tmp_path / name) for name in ("ours", "theirs"))
     assert len(ours) == len(theirs) == 24
     for mine, other in zip(ours, theirs, strict=True):
         assert mine.keys() == other.keys() and mine["task"] == other["task"]
@@ -53,7 +59,7 @@ def test_the_dataset_equals_what_lerobot_merges(
 def test_what_cannot_be_merged_is_refused(
     folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_dataset(tmp_path / "other", lambda frame: (np.float32([1]), np.float32([1, 2])), size=16)
+    write_dataset(tmp_path / "other", partial(numbers, 1), size=16)
     refused = {
         "differ in features, so they cannot be one dataset": ([folders[0], tmp_path / "other"], "new"),
         "holds no meta/info.json": ([folders[0], tmp_path], "new"),

@@ -96,8 +96,9 @@ class _Column:
 
     def __getitem__(self, rows: Any) -> Any:
         frames, key = self._frames, self._key
+        columns: Any = frames._frames
         is_kept = isinstance(rows, list) and (key in frames._numbers or key in frames._columns)
-        return [frames.value(key, row) for row in rows] if is_kept else frames._frames[key][rows]
+        return [frames.value(key, row) for row in rows] if is_kept else columns[key][rows]
 
 
 def _is_numeric(feature: Any) -> bool:

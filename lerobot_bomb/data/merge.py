@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from lerobot.utils.constants import DEFAULT_FEATURES
 
@@ -29,9 +30,8 @@ def merge_datasets(folders: Sequence[Path], repo_id: str, root: Path) -> tuple[i
                 raise ValueError(f"{folder} and {folders[0]} differ in {name}, so they cannot be one dataset")
     features = {key: value for key, value in first.features.items() if key not in DEFAULT_FEATURES}
     arrays = [key for key, value in features.items() if len(value["shape"]) == 2]
-    layout = DatasetLayout(
-        repo_id, first.fps, first.robot_type, features, bool(first.video_keys), tuple(arrays)
-    )
+    robot: Any = first.robot_type  # None in datasets of others
+    layout = DatasetLayout(repo_id, first.fps, robot, features, bool(first.video_keys), tuple(arrays))
     unfinished = root.with_name(f"{root.name}.merging")
     shutil.rmtree(unfinished, ignore_errors=True)
     merge_blocks(layout, list(folders), unfinished)
