@@ -196,7 +196,7 @@ BOTH_FAIL = [without(["camera"], "object:3", "dropped"), without(["object"], "ca
     [
         (
             [without(["object"], "none", None)],
-            "The same seed succeeds without the perturbation object (after 23 steps).",
+            "One perturbation less, and the same seed succeeds: without object (after 23 steps).",
         ),
         (
             [without(["object"], "none", "dropped")],
@@ -208,8 +208,8 @@ BOTH_FAIL = [without(["camera"], "object:3", "dropped"), without(["object"], "ca
                 without(["object"], "camera:3", None),
                 without(["camera", "object"], "none", None),
             ],
-            "The same seed succeeds without the perturbation object (after 23 steps); without any one of the "
-            "other 1 it fails too.",
+            "One perturbation less, and the same seed succeeds: without object (after 23 steps); leaving out "
+            "one of the other 1 does not help.",
         ),
         (
             [*BOTH_FAIL, without(["camera", "object"], "none", None)],
