@@ -91,7 +91,7 @@ def without_perturbations(counterfactuals: Sequence[Values]) -> list[str]:
         ways = [f"without {each['without'][0]}{_steps(each['result'])}" for each in helped]
         rest = len(single) - len(helped)
         others = f"; leaving out one of the other {rest} does not help" if rest else ""
-        return [f"One perturbation less, and the same seed succeeds: {in_a_row(ways, "or")}{others}."]
+        return [f"One perturbation less, and the same seed succeeds: {in_a_row(ways, 'or')}{others}."]
     if clean["result"]["is_success"]:
         told = f"The same seed succeeds unperturbed{_steps(clean['result'])}"
         return [f"{told}, but without any single perturbation it fails too: they break it together."]
