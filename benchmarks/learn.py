@@ -228,17 +228,9 @@ def record(task: Task, demonstrations: int, dataset: Path) -> None:
 
 def merge(folders: Sequence[Path], dataset: Path) -> None:
     """Merge recordings into one dataset."""
-    merging = dataset.with_name("merging")  # not yet whole
-    shutil.rmtree(merging, ignore_errors=True)
     run_command(
-        "lerobot-edit-dataset",
-        f"--new_repo_id={REPO_ID}",
-        f"--new_root={merging}",
-        "--operation.type=merge",
-        f"--operation.repo_ids={json.dumps([REPO_ID] * len(folders))}",
-        f"--operation.roots={json.dumps([str(folder) for folder in folders])}",
+        "lerobot-bomb", "record", "merge", *map(str, folders), f"--repo_id={REPO_ID}", f"--root={dataset}"
     )
-    merging.rename(dataset)
 
 
 def task_ids_of(task: Task) -> tuple[int, ...]:

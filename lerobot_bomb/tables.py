@@ -18,9 +18,9 @@ def shorten(name: str, most: int = MAX_NAME) -> str:
     return f"{name[: most - 1 - last]}…{name[-last:]}"
 
 
-def in_a_row(names: Sequence[str]) -> str:
-    """Return 'a, b and c'."""
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+def in_a_row(names: Sequence[str], last: str = "and") -> str:
+    """Return 'a, b and c'; ``last``: the word before the last name."""
+    return f" {last} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def first_of(names: Sequence[str], most: int) -> list[str]:

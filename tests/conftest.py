@@ -11,22 +11,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from kept_work import check_numbers_once, keep_distributions, keep_flags, look_at_columns_once
 from recipes import POLICY_TYPES
 from variants import variants_of
 
 if TYPE_CHECKING:
     from pusht_cases import Demonstrations
 
+    from lerobot_bomb.bomb.episode import EpisodeSpec
     from lerobot_bomb.libero.assets import Libero
 
 # by CPU time; begun first, none of them is what a run waits for in the end
 SLOWEST_FILES = (
     "test_long",
     "test_parity",
+    "test_explain_command",
+    "test_record_kill",
+    "test_parts",
     "test_replay",
     "test_record",
-    "test_record_kill",
-    "test_explain_command",
     "test_bomb_libero_env",
     "test_shipped",
     "test_sweep",
@@ -130,13 +133,50 @@ def pusht_dataset(pusht_zarr: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.fixture(scope="session", autouse=True)
-def kept_help() -> Iterator[None]:
-    """LeRobot's parser takes half a second to find all flags' help in sources, anew for each command."""
-    from draccus.wrappers import docstring
-
-    kept = functools.cache(docstring.get_attribute_docstring)
+def kept_work() -> Iterator[None]:
+    """Let commands find what others before them have worked out."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(docstring, "get_attribute_docstring", kept)
+        keep_flags(patch)
+        keep_distributions(patch)
+        if "lerobot" in sys.modules:  # importing it takes seconds, and many tests do without
+            look_at_columns_once(patch)
+            check_numbers_once(patch)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def small_pictures() -> Iterator[int | None]:
+    """Draw small what is drawn for people alone, which takes longer than all else; yield the usual size."""
+    env: Any = sys.modules.get("lerobot_env_bomb.env")
+    with pytest.MonkeyPatch.context() as patch:
+        usual = getattr(env, "PERSON_IMAGE_SIZE", None)
+        if env is not None:
+            patch.setattr(env, "PERSON_IMAGE_SIZE", 96)
+        yield usual
+
+
+@pytest.fixture
+def usual_pictures(small_pictures: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw for people as large as users see it."""
+    if small_pictures is not None:
+        monkeypatch.setattr("lerobot_env_bomb.env.PERSON_IMAGE_SIZE", small_pictures)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def recorded_here() -> Iterator[None]:
+    """Run the episodes of a recording with one worker in this process: a worker's start takes longer."""
+    from lerobot_bomb.data import recorded_blocks
+    from lerobot_bomb.data.rollout_pool import RolloutPool, RolloutSettings, RolloutsHere
+
+    def rollouts(
+        settings: RolloutSettings, specs: "Iterator[EpisodeSpec]", num_workers: int
+    ) -> RolloutPool | RolloutsHere:
+        if num_workers == 1:
+            return RolloutsHere(settings, specs)
+        return RolloutPool(settings, specs, num_workers)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recorded_blocks, "RolloutPool", rollouts)
         yield
 
 

@@ -14,7 +14,7 @@ from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.checkpoints.shipped import checkpoint_path, shipped_names
 from lerobot_bomb.envs.rollout import expert_agent, make_env, run_episode
 from lerobot_bomb.explain.images import filling
-from lerobot_bomb.explain.moment import MomentQuery
+from lerobot_bomb.explain.moment_query import MomentQuery
 from lerobot_bomb.explain.other_policies import scored
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.scored_policy import ScoredPolicy

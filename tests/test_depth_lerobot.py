@@ -167,7 +167,7 @@ def test_act_trains_as_without_depth(
     checkpoint = tmp_path / "train" / "checkpoints" / "last" / "pretrained_model"
     for depth in ("false", "true"):
         flags = f"--policy.path={checkpoint} --policy.device=cpu --env.type=bomb --env.image_size={SIZE}"
-        flags += f" --env.fps=2 --env.ignore_checkpoint=true --env.depth={depth}"
+        flags += f" --env.fps=1 --env.ignore_checkpoint=true --env.depth={depth}"
         flags += " --eval.n_episodes=1 --eval.batch_size=1"
         stock_cli("lerobot-eval", *flags.split(), f"--output_dir={tmp_path / depth}")
         info = json.loads((tmp_path / depth / "eval_info.json").read_text())

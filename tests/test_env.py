@@ -261,12 +261,15 @@ def test_info_is_flat(env: BombEnv) -> None:
     assert info["seed"] == SEED and info["stage"] == "start" and info["failure"] == ""
 
 
-def test_the_image_for_people_is_captioned_and_no_observation(env: BombEnv) -> None:
+@pytest.mark.usefixtures("usual_pictures")
+def test_the_image_for_people_is_captioned_and_no_observation() -> None:
+    env = BombEnv(EpisodeSpec(seed=0), SMALL)
     env.reset(seed=SEED)
     image = env.render()
     assert image is not None and image.dtype == np.uint8 and image.shape[1] == 768 and image.shape[0] > 384
     assert (image[390:] > 200).any()  # letters
     assert "stone" in env.task_description and env.task == "place"
+    env.close()
 
 
 def test_each_finished_episode_appends_one_line(tmp_path: Path) -> None:

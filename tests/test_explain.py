@@ -11,7 +11,8 @@ from torch.nn.functional import pad
 
 from lerobot_bomb.explain.activations import LAYER, PARTS, Unit, all_heads, all_layers, all_mlps, recording
 from lerobot_bomb.explain.images import filling, occluded, patch_masks
-from lerobot_bomb.explain.moment import OTHER_INSTRUCTION, explain
+from lerobot_bomb.explain.moment import explain
+from lerobot_bomb.explain.patching import OTHER_INSTRUCTION
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.restoration import Corruption, Restoration
 from lerobot_bomb.explain.scored_policy import repeated

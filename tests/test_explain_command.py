@@ -7,13 +7,16 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_bomb.bomb.board import HALVES
 from lerobot_bomb.commands.main import main
+
+MAX_BYTES = 5e6  # of a page
 
 
 @pytest.mark.one_type
 def test_one_episode(policy_type: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "why"
-    flags = [f"--policy.path=bomb:{policy_type}", "--seed=100000", "--grid=4", f"--output={output}"]
+    flags = [f"--policy.path=bomb:{policy_type}", "--seed=100000", "--grid=2", f"--output={output}"]
     assert main(["explain", *flags]) == 0
     printed = capsys.readouterr().out
     assert {path.name for path in output.iterdir()} == {
@@ -26,26 +29,31 @@ def test_one_episode(policy_type: str, tmp_path: Path, capsys: pytest.CaptureFix
     assert phases == ["reach", "grasp", "carry", "place"]
     assert "\n".join(found["verdict"]) in printed and "It succeeded after" in found["verdict"][0]
     for moment in found["moments"]:
-        assert {len(grid) for grid in moment["patches"].values()} == {4}
+        assert {len(grid) for grid in moment["patches"].values()} == {2}
         assert moment["words"]["row and column"] is not None
         assert {len(each["mlps"]) for each in moment["restored"]} == {2}
         assert "pointing" not in moment and "It points at:" not in moment["findings"]
-        assert {len(grid) for grid in moment["moved_mm"]["patches"].values()} == {4}
+        assert {len(grid) for grid in moment["moved_mm"]["patches"].values()} == {2}
         assert moment["moved_mm"]["objects"].keys() == moment["objects"].keys()
     page = (output / "explanation.html").read_text()
     # the maps, and the filmstrip
-    assert page.count("<img ") == 2 * len(phases) + 1 and "<script" not in page
+    assert page.count("<img ") == 2 * len(phases) + 1 and "<script" not in page and len(page) < MAX_BYTES
     assert all(html.escape(sentence) in page for sentence in found["verdict"])
     assert "http" not in page.replace("http://www.w3.org/1999/xlink", "")
     masked = found["masked_episodes"]
     assert masked["nothing"]["is_success"] and not masked["the whole instruction"]["is_success"]
+    assert {f"object: {name}" for name in HALVES} < masked.keys()
+    # told of another place, it goes there
+    assert {masked[f"another: {word}"]["failure"] for word in ("row", "column")} == {"wrong_intersection"}
     assert masked["nothing"] == found["result"] and found["counterfactuals"] == []
     assert len(found["gripper_xy_m"]) == found["result"]["steps"] + 1
     assert found["masked_paths"]["nothing"]["gripper_xy_m"] == found["gripper_xy_m"]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("number", "last"), [(2, "Effects"), (10, "Where is the destination known?")])
+@pytest.mark.parametrize(
+    ("number", "last"), [(2, "Where in the image"), (10, "Where is the destination known?")]
+)
 def test_several_episodes(number: int, last: str, tmp_path: Path) -> None:
     output = tmp_path / "why"
     flags = ["--policy.path=bomb:fdvla", "--seed=100000", "--grid=2", f"--output={output}"]

@@ -10,7 +10,7 @@ import pytest
 import torch
 from explain_cases import NAMES, SPEC, loaded, moment
 
-from lerobot_bomb.bomb.board import BOARD
+from lerobot_bomb.bomb.board import BOARD, HALVES
 from lerobot_bomb.explain.aggregate import mean_of, means_of
 from lerobot_bomb.explain.counterfactuals import conditions_without
 from lerobot_bomb.explain.diagnosis import used
@@ -145,7 +145,26 @@ def test_json_has_nothing_that_is_no_number() -> None:
 
 def test_every_pixel_shows_one_thing() -> None:
     for masks in moment()[2].values():
-        assert np.sum([*masks.values()], axis=0).tolist() == np.ones((64, 64)).tolist()
+        whole = [mask for name, mask in masks.items() if name not in HALVES]
+        assert np.sum(whole, axis=0).tolist() == np.ones((64, 64)).tolist()
+        for two in (HALVES[:2], HALVES[2:]):
+            assert np.array_equal(masks[two[0]] ^ masks[two[1]], masks["board"])
+
+
+def test_halves_of_the_board_hold_its_outer_lines() -> None:
+    corners = np.array([BOARD.intersection_xy(row, column) for row in (0, 4) for column in (0, 4)])
+    assert {name: half.tolist() for name, half in BOARD.halves(corners).items()} == {
+        "board's left half": [True, False, True, False],
+        "board's right half": [False, True, False, True],
+        "board's far half": [True, True, False, False],
+        "board's near half": [False, False, True, True],
+    }
+
+
+def test_halves_in_the_image_are_where_the_camera_sees_them() -> None:
+    masks = moment()[2]["workspace"]
+    left, right, far, near = (np.argwhere(masks[name]).mean(axis=0) for name in HALVES)
+    assert left[1] < right[1] and far[0] < near[0]  # this camera looks from the near side
 
 
 def test_masks_show_stone_gripper_and_target_in_both_cameras() -> None:

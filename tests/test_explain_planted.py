@@ -10,7 +10,9 @@ from explain_cases import FAST_NAMES, GRID, WORKSPACE, WRIST, ask, fresh, moment
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.explain.diagnosis import diagnose
 from lerobot_bomb.explain.limits import smallest_drop
-from lerobot_bomb.explain.moment import OTHER_SCENE, Explanation, camera_name, explain
+from lerobot_bomb.explain.moment import Explanation, explain
+from lerobot_bomb.explain.moment_query import camera_name
+from lerobot_bomb.explain.patching import OTHER_SCENE
 from lerobot_bomb.explain.scored_policy import INSTRUCTION
 from lerobot_bomb.explain.spans import difference, span_of, token_offsets
 from lerobot_bomb.explain.verdict import reasons

@@ -53,6 +53,20 @@ def test_one_that_never_looked_at_the_stone() -> None:
     ]
 
 
+def test_a_half_of_the_board_that_matters_most_is_named() -> None:
+    objects = {"stone": 0.3, "board": 9.0, "board's left half": 14.0, "board's far half": 12.0}
+    assert reasons([moment("reach", mm=seen(**objects))])[:2] == [
+        "In the one step examined, it never looked at the stone: hiding it changes the next action by at "
+        "most 0.3 mm, hiding the board's left half by 14.0 mm at reach.",
+        "It looks at the board's left half (14.0 mm at reach): so much the next action moves when that is "
+        "hidden.",
+    ]
+    as_much = reasons([moment("reach", mm=seen(**objects | {"board": 14.0}))])
+    assert as_much[1].startswith("It looks at the board's left half (14.0 mm")
+    weaker = seen(**objects | {"board": 15.0})
+    assert "half" not in " ".join(reasons([moment("reach", mm=weaker)]))
+
+
 def test_one_that_looks_at_nothing_and_reads_nothing() -> None:
     values = seen(stone=0.1, board=0.3) | {"words": {"row": 0.0}, "others": {"row": 0.04}}
     assert reasons([moment(mm=values)]) == [
@@ -118,9 +132,11 @@ def test_heads_that_carry_the_instruction_are_named(heads: list[list[float | Non
         {"corruption": "wrist patch 1, 2 taken out", "drop": 9.0, "heads": [[1.0, 1.0], [1.0, 1.0]]},
         {"corruption": "other instruction: 'Place it.'", "drop": 0.4, "heads": heads},
     ]
+    restored = [{"moved_mm": None, **each} for each in restored]
     assert reasons([moment("carry", restored=restored)])[-1].startswith(told)
-    weak = [restored[1] | {"drop": 1e-5}]
-    assert reasons([moment("carry", restored=weak)])[-1] == "It reads no instruction."
+    for weak in ({"drop": 1e-5}, {"moved_mm": 0.9}):
+        sentences = reasons([moment("carry", restored=[restored[1] | weak])])
+        assert sentences[-1] == "It reads no instruction."
 
 
 def test_pointing_tells_misreading_from_not_acting() -> None:
@@ -180,7 +196,7 @@ BOTH_FAIL = [without(["camera"], "object:3", "dropped"), without(["object"], "ca
     [
         (
             [without(["object"], "none", None)],
-            "The same seed succeeds without the perturbation object (after 23 steps).",
+            "One perturbation less, and the same seed succeeds: without object (after 23 steps).",
         ),
         (
             [without(["object"], "none", "dropped")],
@@ -192,8 +208,8 @@ BOTH_FAIL = [without(["camera"], "object:3", "dropped"), without(["object"], "ca
                 without(["object"], "camera:3", None),
                 without(["camera", "object"], "none", None),
             ],
-            "The same seed succeeds without the perturbation object (after 23 steps); without any one of the "
-            "other 1 it fails too.",
+            "One perturbation less, and the same seed succeeds: without object (after 23 steps); leaving out "
+            "one of the other 1 does not help.",
         ),
         (
             [*BOTH_FAIL, without(["camera", "object"], "none", None)],
@@ -218,6 +234,60 @@ def test_masks_that_turn_the_outcome_are_named() -> None:
     masked = {"nothing": result("dropped"), "object: stone": result("dropped")}
     episode = {"result": result("dropped"), "moments": [moment()], "masked_episodes": masked}
     assert verdict([episode])[1] == "Whatever single input is hidden in every step, it still fails."
+
+
+AT_TARGET = {"nearest_intersection": [4, 2]}
+WRONG = result("wrong_intersection")
+
+
+@pytest.mark.parametrize(
+    ("masked", "told"),
+    [
+        (
+            {"object: gripper": result("imprecise", **AT_TARGET)},
+            ["With the gripper hidden in every step, the stone is put down at the right intersection, row 4, "
+             "column 2, not at row 3, column 2."],
+        ),
+        (
+            {
+                "object: gripper": result(),
+                "words: row and column": result(),
+                "another: color": result(),
+                "another: row": result("imprecise", **AT_TARGET),
+            },
+            [
+                "With the gripper or the words for row and column hidden, or another colour named, in every "
+                "step, it succeeds.",
+                "With another row named in every step, the stone is put down at the right intersection, row "
+                "4, column 2, not at row 3, column 2.",
+            ],
+        ),
+        # not put down there: the stone lay there all the time, or was let fall
+        ({"object: gripper": result("missed_grasp", **AT_TARGET)}, []),
+        ({"object: gripper": result("dropped", **AT_TARGET)}, []),
+    ],
+)  # fmt: skip
+def test_a_change_that_turns_a_failure_right_comes_first(masked: dict[str, Any], told: list[str]) -> None:
+    masked = {"nothing": WRONG, **masked}
+    episode = {"result": WRONG, "moments": [moment()], "masked_episodes": masked}
+    found = verdict([episode])
+    assert found[: len(told)] == told and found[len(told)].startswith("It failed (wrong_intersection)")
+    assert ("Whatever single input" in " ".join(found)) is not bool(told)
+
+
+def test_a_stone_that_was_never_put_down_is_put_down_right() -> None:
+    held, put = result("timeout_holding", **AT_TARGET), result("imprecise", **AT_TARGET)
+    masked = {"nothing": held, "object: stone": put}
+    assert verdict([{"result": held, "moments": [moment()], "masked_episodes": masked}])[0] == (
+        "With the stone hidden in every step, the stone is put down at the right intersection, row 4, "
+        "column 2."
+    )
+
+
+def test_a_success_needs_no_other_words() -> None:
+    masked = {"nothing": result(), "another: row": result("wrong_intersection")}
+    episode = {"result": result(), "moments": [moment()], "masked_episodes": masked}
+    assert verdict([episode])[1] == "Whatever single input is hidden in every step, it still succeeds."
 
 
 def test_a_run_that_ended_otherwise_than_its_record_says_so() -> None:

@@ -10,11 +10,11 @@ from PIL import Image
 from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_bomb.envs.rollout import Agent, expert_agent, make_env, run_episode
+from lerobot_bomb.envs.rollout import Agent, Moment, expert_agent, make_env, run_episode
 from lerobot_bomb.viewing.bomb import BombView, bomb_episode
 from lerobot_bomb.viewing.bomb_film import bomb_contact, bomb_shot
-from lerobot_bomb.viewing.episode import ViewedRun, write_episode_with_film, write_episodes
-from lerobot_bomb.viewing.film import RING_RGB, TILE_SIZE, Film, Marks, drawn, film_of
+from lerobot_bomb.viewing.episode import ViewedRun, write_episodes
+from lerobot_bomb.viewing.film import RING_RGB, TILE_SIZE, Film, Marks, drawn, run_filmed
 from lerobot_bomb.viewing.sheet import BAR_HEIGHT, title_bar
 
 SPEC = EpisodeSpec(seed=4, target=(3, 2), color="white", fps=5, perturbations="camera:3")
@@ -42,6 +42,7 @@ def test_marks_are_drawn_where_they_belong() -> None:
     assert (xs.mean(), ys.mean()) == (pytest.approx(130, abs=3), pytest.approx(130, abs=4))
 
 
+@pytest.mark.usefixtures("usual_pictures")
 def test_the_ring_is_where_the_target_is_and_lines_are_numbered() -> None:
     env = make_env(SPEC, OPTIONS)
     *_, last = run_episode(env, SPEC, expert_agent())
@@ -63,6 +64,20 @@ def test_the_ring_is_where_the_target_is_and_lines_are_numbered() -> None:
     env.close()
 
 
+@pytest.mark.parametrize(
+    ("stage", "name"),
+    [
+        ("start", ""),
+        ("reached", "contact"),
+        ("grasped", "gripper closes"),
+        ("lifted", "grasp"),
+        ("placed", "grasp"),
+    ],
+)
+def test_only_a_stone_that_was_lifted_was_grasped(stage: str, name: str) -> None:
+    assert bomb_contact(Moment(0, "", {}, {"stage": stage}, None)) == name
+
+
 @pytest.mark.parametrize(("agent", "name"), [(expert_agent(), "grasp"), (still, "middle")])
 def test_the_moment_in_the_middle_is_the_first_grasp_if_there_is_one(agent: Agent, name: str) -> None:
     env = make_env(SPEC, OPTIONS)
@@ -76,15 +91,15 @@ def test_the_moment_in_the_middle_is_the_first_grasp_if_there_is_one(agent: Agen
     assert film.moments == {"start": 0, f"{name}, step {step}": step, f"end, step {last}": last}
 
 
+@pytest.mark.usefixtures("usual_pictures")
 def test_a_video_and_its_film_come_from_one_run(tmp_path: Any) -> None:
     run = viewed_run(expert_agent())
     rrd, mp4 = tmp_path / "x.rrd", tmp_path / "x.mp4"
-    result, film = write_episode_with_film(run, "x", rrd, mp4)
-    alone, again = film_of(run)
-    assert result.is_success and result == again
+    ((result, film),) = write_episodes({"": run}, "x", rrd, mp4, with_films=True)
+    again, alone = run_filmed(run)
+    assert result.is_success and result == again and film is not None and alone is not None
     np.testing.assert_array_equal(film, alone)
-    (other,) = write_episodes({"": run}, "y", tmp_path / "y.rrd", tmp_path / "y.mp4")
-    assert other == result
+    assert write_episodes({"": run}, "y", tmp_path / "y.rrd", tmp_path / "y.mp4") == [(result, None)]
     assert mp4.read_bytes() == (tmp_path / "y.mp4").read_bytes()
 
 

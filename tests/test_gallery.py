@@ -164,10 +164,9 @@ def test_the_committed_page_is_the_generated_one() -> None:
     assert (DOCS / "perturbations.md").read_text() == page(example_instructions(), "media/perturbations")
 
 
-def test_the_page_has_every_axis_with_its_magnitudes_and_its_sheet() -> None:
+def test_the_page_has_every_axis_with_its_sheet() -> None:
     text = (DOCS / "perturbations.md").read_text()
     assert re.findall(r"^## (\w+)$", text, re.MULTILINE) == [*AXES, ALL]
-    assert "| angle | 3 | 6 | 9 | 12.5 | 16 | degrees | around the board, in a drawn direction |" in text
     links = re.findall(r"\]\((.*?\.jpg)\)", text)
     assert links == [f"media/perturbations/{name}.jpg" for name in (*AXES, ALL)]
     for link in links:

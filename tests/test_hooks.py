@@ -30,7 +30,7 @@ ON_FIRST_USE = {
     "lerobot.configs.eval.EvalPipelineConfig.__post_init__",
     "lerobot.configs.policies.PreTrainedConfig.from_pretrained",
     "lerobot.datasets.dataset_metadata.LeRobotDatasetMetadata.__init__",
-    "lerobot.datasets.dataset_reader.DatasetReader._query_hf_dataset",
+    "lerobot.datasets.dataset_reader.DatasetReader._load_hf_dataset",
     "lerobot.policies.pretrained.PreTrainedPolicy.__init__",
     "lerobot.processor.pipeline.DataProcessorPipeline._build_steps_with_overrides",
     "sys.excepthook",

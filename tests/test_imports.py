@@ -32,8 +32,8 @@ ORDER = [
     "__init__", "registry", "compat", "finite", "flag_errors", "flags", "conditions", "environments",
     "stats", "bootstrap", "smoothness", "tables", "files", "cuda_graphs",
     "bomb", "pusht", "libero", "results", "envs", "actions", "flow", "vlm", "decoding", "training", "data",
-    "checkpoints", "evaluation", "viewing", "explain", "hub", "policies", "serving", "harness", "sweep",
-    "report", "commands",
+    "checkpoints", "evaluation", "viewing", "explain", "report", "hub", "policies", "serving", "harness",
+    "sweep", "commands",
 ]  # fmt: skip
 
 

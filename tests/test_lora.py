@@ -201,7 +201,7 @@ def test_adapters_are_trained_resumed_and_evaluated_by_stock_commands(
     assert all(tensor.any() for name, tensor in weights[0].items() if "lora_B" in name)
     assert all(torch.equal(weights[1][name], tensor) for name, tensor in weights[0].items())
     assert json.loads((second / "config.json").read_text())["trained_batches"] == 2
-    flags = f"--policy.path={second} --env.type=bomb --env.task=place --env.image_size=64 --env.fps=2"
+    flags = f"--policy.path={second} --env.type=bomb --env.task=place --env.image_size=64 --env.fps=1"
     flags += (
         " --env.ignore_checkpoint=true --eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false"
     )

@@ -71,7 +71,7 @@ def test_in_100_pairs_the_same_difference_is_not_shown_and_it_says_how_many_are_
     assert run("compare", a, b, "--non_inferior=5") == ANSWER_IS_NO
     out = capsys.readouterr().out
     assert "B - A      -5.0 points [" in out and "of 100 pairs, p = 0.23" in out
-    told = r"no difference is shown: A has 5 points \[-\d+, \d+\] more \(100 pairs, p = 0\.23; about \d+ .*"
+    told = r"not significant: A leads by 5 points \[-\d+, \d+\] \(100 pairs, p = 0\.23; about \d+ .*"
     assert re.fullmatch(told, out.splitlines()[1])
 
 

@@ -69,9 +69,9 @@ def test_policies_are_ranked_on_the_episodes_that_all_have(report: Callable[...,
     assert [row["on shared episodes"]["n"] for row in summary(section)] == [2, 2]
     assert section["statements"][:2] == [
         "Ranking on place by the 2 unperturbed episodes that all policies have: act 100 %, fdvla 50 %.",
-        "act against fdvla: unperturbed, no difference is shown: act has 50 points [-27, 91] more (2 pairs, "
-        "p = 1; about 17 pairs would show this much). Under camera:3, no difference is shown: act has 50 "
-        "points [-27, 91] more (2 pairs, p = 1; about 17 pairs would show this much).",
+        "act against fdvla: unperturbed, not significant: act leads by 50 points [-27, 91] (2 pairs, "
+        "p = 1; about 17 pairs would be enough). Under camera:3, not significant: act leads by 50 points "
+        "[-27, 91] (2 pairs, p = 1; about 17 pairs would be enough).",
     ]
     assert section["lines"] == [
         "act, place: 5 of its 9 episodes were not run by all policies; pairs and ranking leave them out",

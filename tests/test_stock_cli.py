@@ -16,7 +16,7 @@ from lerobot_bomb.results.origin import Evaluation
 
 Run = Callable[..., None]
 REPO_ID = "test/bomb_place"
-SHORT = "--env.fps=2 --env.ignore_checkpoint=true"  # episodes of 20 steps, on recordings at 10 Hz
+SHORT = "--env.fps=1 --env.ignore_checkpoint=true"  # episodes of 10 steps, on recordings at 10 Hz
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_each_condition_has_a_rate_and_a_recording(stock_cli: Run, tmp_path: Pat
 def test_surplus_episodes_of_the_last_batch_are_in_no_file(stock_cli: Run, tmp_path: Path) -> None:
     flags = "--policy.type=bomb_random --eval.n_episodes=4 --eval.batch_size=3 --eval.use_async_envs=false"
     info = evaluate(
-        stock_cli, tmp_path, f'{flags} --seed=5 --env.fps=2 --env.perturbations=["none","light:3"]'
+        stock_cli, tmp_path, f'{flags} --seed=5 --env.fps=1 --env.perturbations=["none","light:3"]'
     )
     assert info["overall"]["n_episodes"] == 8
     rows = read_results(tmp_path / "results.jsonl", EpisodeResult)
@@ -131,7 +131,7 @@ def test_a_video_ends_with_the_outcome(
 
 def test_random_actions_fail(stock_cli: Run, tmp_path: Path) -> None:
     flags = "--policy.type=bomb_random --eval.n_episodes=2 --eval.batch_size=2 --eval.use_async_envs=false"
-    assert evaluate(stock_cli, tmp_path, f"{flags} --env.fps=2")["overall"]["pc_success"] == 0.0
+    assert evaluate(stock_cli, tmp_path, f"{flags} --env.fps=1")["overall"]["pc_success"] == 0.0
     assert all(row.failure for row in read_results(tmp_path / "results.jsonl", EpisodeResult))
 
 

@@ -53,8 +53,8 @@ def train(run: Run, stock_type: str, dataset: Path, folder: Path) -> Path:
 
 
 def evaluate(run: Run, checkpoint: Path, folder: Path, *flags: str) -> list[EpisodeResult]:
-    """Run one perturbed episode of 20 steps."""
-    env = "--env.type=bomb --env.image_size=64 --env.fps=2 --env.ignore_checkpoint=true"
+    """Run one perturbed episode of 10 steps."""
+    env = "--env.type=bomb --env.image_size=64 --env.fps=1 --env.ignore_checkpoint=true"
     batch = "--eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false --policy.device=cpu"
     results = folder / "results.jsonl"
     where = [f"--env.results_path={results}", f"--output_dir={folder / 'eval'}"]

@@ -17,6 +17,9 @@ pytest.importorskip("gym_pusht", reason="gym-pusht is not installed: pip install
 
 from bomb_pusht_cases import pusht_env
 
+from lerobot_bomb.envs.rollout import Moment
+from lerobot_bomb.pusht.episode import BOARD_PX
+from lerobot_bomb.viewing.pusht import PushTView
 from lerobot_bomb.viewing.sheet import BAR_HEIGHT
 from lerobot_env_bomb_pusht.env import BombPushTEnv
 
@@ -131,3 +134,22 @@ def test_a_checkpoint_of_other_images_is_told_the_flag(
     wide = ["--image_size=96", "--ignore_checkpoint", f"--output={tmp_path / 'x'}"]
     assert main([*FLAGS, policy, *wide]) == 0
     assert main([*FLAGS, policy, f"--output={tmp_path / 'own'}"]) == 0  # images of the size that it reads
+
+
+def test_a_filmstrip_marks_the_target_and_what_is_covered() -> None:
+    env = pusht_env("goal:3")
+    observation, info = env.reset(seed=3)
+    first = PushTView().shot(env, Moment(0, "", observation, info, None))
+    assert first.marks["camera"].words == {}  # nothing is measured before a step
+    observation, *_, info = env.step(np.array([256.0, 256.0], np.float32))
+    shot = PushTView().shot(env, Moment(1, "", observation, info, None))
+    marks, side = shot.marks["camera"], shot.images["camera"].shape[0]
+    assert [*marks.words] == [f"covered: {info['coverage']:.0%}"]
+    (outline,) = marks.outlines
+    corners = np.array(outline, np.float32) * (BOARD_PX / side)
+    # a bar of 120 x 30 pixels on a stem of 30 x 90
+    assert len(corners) == 8 and cv2.contourArea(corners) == pytest.approx(6300, abs=5)
+    x, y, angle_rad = info["goal_pose"]
+    end = np.array([x, y]) + 120 * np.array([-np.sin(angle_rad), np.cos(angle_rad)])
+    assert np.linalg.norm(corners - end, axis=1).min() == pytest.approx(15, abs=0.1)  # half the stem's width
+    env.close()

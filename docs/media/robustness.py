@@ -13,14 +13,13 @@ import tempfile
 from pathlib import Path
 
 from lerobot_bomb.commands.results_files import read_undamaged
+from lerobot_bomb.report.chart import standalone
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.sections import answer
 from lerobot_bomb.results.groups import groups_of
 
 MEDIA = Path(__file__).parent
 RECORDS, FIGURE = MEDIA / "shipped.jsonl.gz", MEDIA / "robustness.svg"
-NAMESPACES = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
-PAPER = "color:#222;background:#fff;"  # a page's own colours do not reach an image
 
 
 def figure() -> str:
@@ -30,7 +29,7 @@ def figure() -> str:
         path.write_bytes(gzip.decompress(RECORDS.read_bytes()))
         groups = groups_of(read_undamaged(path).records)
     (chart,) = answer.section(Report(groups)).charts
-    return chart.svg.replace("<svg ", f"<svg {NAMESPACES} ", 1).replace('style="', f'style="{PAPER}', 1)
+    return standalone(chart.svg)
 
 
 if __name__ == "__main__":

@@ -15,10 +15,11 @@ BOARD_GEOMS = ("board", "board_surface")
 def object_masks(
     scene: Scene, renderer: CameraRenderer, camera: str, size: int, stone: int, target_xy: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """{object: (size, size) bool}; every pixel belongs to exactly one.
+    """{object: (size, size) bool}; every pixel belongs to exactly one, besides the board's halves.
 
     ``stone``: index of the stone to move; ``target_xy``: (2,) metres, its target. The target is as
-    much of the board as a stone there would cover; the gripper is all of the arm that is seen.
+    much of the board as a stone there would cover, and no part of the board here; the gripper is all of the
+    arm that is seen. The halves are those of the board in the world, whatever the camera sees.
     """
     model = scene.model
     geom = renderer.draw_geoms(scene.data, camera, size)
@@ -36,7 +37,8 @@ def object_masks(
         GRIPPER: is_gripper,
         BOARD_ITSELF: is_board & ~is_target,
     }
-    return masks | {BACKGROUND: ~np.any([*masks.values()], axis=0)}
+    halves = {name: masks[BOARD_ITSELF] & half for name, half in BOARD.halves(xy).items()}
+    return masks | halves | {BACKGROUND: ~np.any([*masks.values()], axis=0)}
 
 
 def _on_plane(scene: Scene, camera: str, size: int, height_m: float) -> np.ndarray:

@@ -109,11 +109,15 @@ class Board(PushTEnv):
 
     def _draw_outline(self, screen: pygame.Surface) -> None:
         """Draw a line around the target."""
+        pygame.draw.lines(screen, OUTLINE_RGB, True, self.target_outline.tolist(), self.outline_px)
+
+    @property
+    def target_outline(self) -> np.ndarray:
+        """(8, 2) pixels of the board, the corners of the target, in order."""
         goal = self.get_goal_pose_body(self.goal_pose)
         bar, stem = (shape.get_vertices() for shape in self._block_shapes)
         corners = tee_outline(np.array(bar), np.array(stem))
-        points = [goal.local_to_world(tuple(corner)) for corner in corners.tolist()]
-        pygame.draw.lines(screen, OUTLINE_RGB, True, points, self.outline_px)
+        return np.array([goal.local_to_world(tuple(corner)) for corner in corners.tolist()])
 
 
 def tee_outline(bar: np.ndarray, stem: np.ndarray) -> np.ndarray:

@@ -118,6 +118,10 @@ class BombPushTEnv(EpisodeEnv[PushTSpec, _Run, PushTResult]):
             policy=self._policy,
         )
 
+    def target_outline(self) -> np.ndarray:
+        """(8, 2) pixels of the board, the corners of the target, in order."""
+        return self._board.target_outline
+
     def close(self) -> None:
         """Free gym-pusht's resources."""
         self._board.close()

@@ -13,6 +13,7 @@ TRAY_HALF_SIZE_XY = (0.045, 0.125)  # metres; it touches the board
 PATTERN_CENTER_XY = (0.170, -0.090)  # metres
 PATTERN_PITCH_M = 0.012
 PATTERN_HALF_SIZE_M = 0.032
+HALVES = tuple(f"board's {side} half" for side in ("left", "right", "far", "near"))
 NUM_STONES = 12  # stones in the compiled model: on the board, to be moved, or parked out of sight
 
 
@@ -41,6 +42,11 @@ class BoardGeometry:
             )
         middle = (self.num_lines - 1) / 2
         return np.array([(column - middle) * self.pitch_m, (middle - row) * self.pitch_m])
+
+    def halves(self, xy: np.ndarray) -> dict[str, np.ndarray]:
+        """{half: (...) bool}: world xy (..., 2) in metres that lie in it; left has column 0, far row 0."""
+        x, y = xy[..., 0], xy[..., 1]
+        return dict(zip(HALVES, (x < 0, x >= 0, y >= 0, y < 0), strict=True))
 
     def nearest_intersection(self, xy: np.ndarray) -> tuple[int, int]:
         """(row, column) of the intersection nearest to a world xy in metres."""

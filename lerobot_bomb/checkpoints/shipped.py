@@ -6,9 +6,9 @@ Wherever LeRobot's commands and ours take a checkpoint, `bomb:NAME` is one of th
 from pathlib import Path
 
 from lerobot_bomb.checkpoints.names import CONFIG
+from lerobot_bomb.results.names import SHIPPED_PREFIX
 
 FOLDER = Path(__file__).parent / "weights"
-PREFIX = "bomb:"
 
 
 def shipped_names() -> list[str]:
@@ -29,16 +29,12 @@ def shipped_checkpoint(name: str) -> Path:
     return FOLDER / name
 
 
-def shipped_name(path: str) -> str | None:
-    """Return `bomb:NAME` for the folder of a shipped checkpoint; None for any other path."""
-    folder = Path(path)
-    return f"{PREFIX}{folder.name}" if folder.parent == FOLDER and folder.name in shipped_names() else None
-
-
 def checkpoint_path(text: str) -> str:
     """Return a checkpoint's path: for `bomb:NAME` its folder, anything else unchanged.
 
     Raises:
         ValueError: no checkpoint of this name comes with the package.
     """
-    return str(shipped_checkpoint(text.removeprefix(PREFIX))) if text.startswith(PREFIX) else text
+    if not text.startswith(SHIPPED_PREFIX):
+        return text
+    return str(shipped_checkpoint(text.removeprefix(SHIPPED_PREFIX)))

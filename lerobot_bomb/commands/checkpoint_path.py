@@ -2,7 +2,8 @@
 
 import argparse
 
-from lerobot_bomb.checkpoints.shipped import FOLDER, PREFIX, shipped_checkpoint, shipped_names
+from lerobot_bomb.checkpoints.shipped import FOLDER, shipped_checkpoint, shipped_names
+from lerobot_bomb.results.names import SHIPPED_PREFIX
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -13,8 +14,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the folder of one, or name and folder of all."""
     if args.name is not None:
-        print(shipped_checkpoint(args.name.removeprefix(PREFIX)))
+        print(shipped_checkpoint(args.name.removeprefix(SHIPPED_PREFIX)))
         return 0
     for name in shipped_names():
-        print(f"{PREFIX}{name}  {FOLDER / name}")
+        print(f"{SHIPPED_PREFIX}{name}  {FOLDER / name}")
     return 0

@@ -11,13 +11,13 @@ import numpy as np
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
 from lerobot_bomb.bomb.perturbations import Condition
-from lerobot_bomb.checkpoints.shipped import PREFIX
 from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.files import check_new_folder
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.groups import by_condition, rate_of, read_results
+from lerobot_bomb.results.names import SHIPPED_PREFIX
 from lerobot_bomb.sweep.manifest import largest_divisor
 from lerobot_bomb.tables import print_table
 
@@ -36,7 +36,7 @@ class DemoPolicy:
 
 
 POLICIES = {
-    POLICY: DemoPolicy(f"--policy.path={PREFIX}{POLICY}"),
+    POLICY: DemoPolicy(f"--policy.path={SHIPPED_PREFIX}{POLICY}"),
     "expert": DemoPolicy("--policy.type=bomb_expert"),
     "random": DemoPolicy("--policy.type=bomb_random", (NONE,)),
 }

@@ -48,10 +48,11 @@ def _push_dataset(args: argparse.Namespace) -> int:
         if value:
             raise ValueError(f"{flag} is of a checkpoint, and {args.folder} is a dataset; drop it")
     from lerobot_bomb.hub.dataset import publish_dataset, read_dataset  # LeRobot: seconds
+    from lerobot_bomb.hub.push import CARD
 
     dataset = read_dataset(args.folder, args.repo_id)
     if args.dry_run:
-        print(dataset.card, *dataset.files, sep="\n")
+        print(dataset.card, *sorted(dataset.contents.keys() - {CARD}), sep="\n")
         return 0
     print(publish_dataset(dataset, args.private or None).commit_url)
     return 0

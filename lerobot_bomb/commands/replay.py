@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     name += f"_{runs[CHANGED].viewed.group}" if args.set is not None else ""
     paths = paths_of(args.output, DEFAULT_FOLDER, name)
     check_new(paths)
-    results = write_episodes(runs, name, *paths)
+    results = [result for result, _ in write_episodes(runs, name, *paths)]
     for (label, run), result in zip(runs.items(), results, strict=True):
         viewed, values = run.viewed, cast("Any", result)
         print_lines(f"{label} ({viewed.spec.perturbations}): {values.instruction}")

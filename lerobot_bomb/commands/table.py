@@ -14,6 +14,9 @@ Datasets and episodes
   record: record the scripted expert as a LeRobotDataset
     $ --repo_id=me/bomb --root=data/bomb --episodes=10 --env.image_size=64 --images
     $ --repo_id=me/all --root=data/all --episodes=10 --env.task=all --env.perturbations=all:1-5
+  record merge: join datasets, such as demonstrations and static scenes, into one
+    $ data/shown data/scenes --repo_id=me/both --root=data/both
+    $ data/a data/b data/c --repo_id=me/abc
   convert pusht-zarr: make a LeRobotDataset of Diffusion Policy's PushT demonstrations
     $ pusht_cchi_v7_replay.zarr --repo_id=me/pusht --root=data/pusht
     $ pusht_cchi_v7_replay.zarr --repo_id=me/pusht8 --root=data/pusht8 --copies=7 --resume

@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
     name = viewed.name(policy)
     paths = paths_of(args.output, DEFAULT_FOLDER, name)
     run = ViewedRun(viewed, partial(_agent, args, policy, viewed, paths))
-    (result,) = write_episodes({policy: run}, name, *paths)
+    ((result, _),) = write_episodes({policy: run}, name, *paths)
     values: Any = result
     print(values.instruction, viewed.log.describe(result), *paths, sep="\n")
     return 0

@@ -18,7 +18,7 @@ from lerobot_bomb.data.kept_blocks import Progress, episodes_before, reached
 from lerobot_bomb.data.libero_recording import LiberoRecording, LiberoRollout
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import add_block, block_episodes, missing_blocks
-from lerobot_bomb.data.rollout_pool import RelabelledRollouts, Rollout, RolloutPool, Rollouts, RolloutSettings
+from lerobot_bomb.data.rollout_pool import Rollout, RolloutPool, Rollouts, RolloutSettings, RolloutsHere
 from lerobot_bomb.envs.rollout import Agent, Expert
 
 if TYPE_CHECKING:
@@ -49,13 +49,13 @@ class EpisodeSource:
     expert: Expert = expert_action
     behavior: BehaviorPolicy | None = None  # the expert says what it would have done
 
-    def rollouts(self, recording: AnyRecording, num_tried: int) -> RolloutPool | RelabelledRollouts:
+    def rollouts(self, recording: AnyRecording, num_tried: int) -> RolloutPool | RolloutsHere:
         """Return the episodes of a recording after the first `num_tried`."""
         settings = self.settings(recording)
         specs: Iterator[Any] = recording.specs(num_tried)
         if self.behavior is None or not isinstance(settings, RolloutSettings):
             return RolloutPool(settings, specs, self.num_workers)
-        return RelabelledRollouts(settings, specs, self.behavior.begin, self.behavior.agent)
+        return RolloutsHere(settings, specs, self.behavior.begin, self.behavior.agent)
 
     def settings(self, recording: AnyRecording) -> Rollouts:
         """Return how a recording's episodes are run."""

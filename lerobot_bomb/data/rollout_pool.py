@@ -157,11 +157,22 @@ def _pointing(spec: EpisodeSpec, observations: list[dict[str, Any]]) -> dict[str
     return {name: np.stack([row[name] for row in rows]) for name in COLUMNS}
 
 
-class RelabelledRollouts:
-    """Episodes of another agent, in this process: what it saw, and what the expert would have done there."""
+class RolloutsHere:
+    """Episodes that are run in this process, those of another agent if there is one.
+
+    Args:
+        settings: of all episodes.
+        specs: of each episode.
+        begin: called before each episode.
+        agent: acts instead of the expert, who says what it would have done; failed episodes are kept, too.
+    """
 
     def __init__(
-        self, settings: RolloutSettings, specs: Iterator[EpisodeSpec], begin: Callable[[], None], agent: Agent
+        self,
+        settings: RolloutSettings,
+        specs: Iterator[EpisodeSpec],
+        begin: Callable[[], None] = lambda: None,
+        agent: Agent | None = None,
     ) -> None:
         self._worker, self._specs, self._begin = _Worker(settings, agent), specs, begin
 

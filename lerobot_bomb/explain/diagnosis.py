@@ -5,7 +5,9 @@ from dataclasses import dataclass
 from typing import Self
 
 from lerobot_bomb.explain.limits import ALL, RESTORES, SHARE, smallest_drop
-from lerobot_bomb.explain.moment import Explanation, PatchingResult, camera_name
+from lerobot_bomb.explain.moment import Explanation
+from lerobot_bomb.explain.moment_query import camera_name
+from lerobot_bomb.explain.patching import PatchingResult
 
 MAX_NAMES = 6  # that are shown
 

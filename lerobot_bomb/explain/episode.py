@@ -12,7 +12,8 @@ from lerobot_bomb.checkpoints.folder import autocast
 from lerobot_bomb.explain.activations import LAYER, recording
 from lerobot_bomb.explain.diagnosis import Finding, diagnose
 from lerobot_bomb.explain.following import Following, following
-from lerobot_bomb.explain.moment import OBSERVATION, Explanation, MomentQuery, explain, finite, image_keys
+from lerobot_bomb.explain.moment import Explanation, explain, finite, image_keys
+from lerobot_bomb.explain.moment_query import OBSERVATION, MomentQuery
 from lerobot_bomb.explain.next_actions import NextActions
 from lerobot_bomb.explain.other_policies import scored
 from lerobot_bomb.explain.pointing import PointingCheck, check_pointing

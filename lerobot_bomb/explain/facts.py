@@ -1,4 +1,4 @@
-"""Sentences about how episodes ended: as recorded, without a perturbation, with something hidden.
+"""Sentences about how episodes ended: as recorded, without a perturbation, with something hidden or reworded.
 
 They read the values of `explanation.json`.
 """
@@ -10,9 +10,14 @@ from lerobot_bomb.bomb.episode import Failure
 from lerobot_bomb.bomb.judge import COLLATERAL_TOLERANCE_MM
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.explain.effects import Values
+from lerobot_bomb.explain.limits import MAX_NAMES
+from lerobot_bomb.explain.mask_names import NOTHING, is_hidden, subject
+from lerobot_bomb.results.bomb import PUT_DOWN
 from lerobot_bomb.results.summary import named_counts
 from lerobot_bomb.stats import format_rate
+from lerobot_bomb.tables import first_of, in_a_row
 
+WHATEVER = "Whatever single input is hidden in every step"
 # what happened, by failure class of BOMB
 HAPPENED = {
     Failure.NEVER_REACHED: "the gripper never came to the stone",
@@ -83,10 +88,10 @@ def without_perturbations(counterfactuals: Sequence[Values]) -> list[str]:
     single = [each for each in counterfactuals if len(each["without"]) == 1]
     helped = [each for each in single if each["result"]["is_success"]]
     if helped:
-        ways = " or ".join(f"{each['without'][0]}{_steps(each['result'])}" for each in helped)
+        ways = [f"without {each['without'][0]}{_steps(each['result'])}" for each in helped]
         rest = len(single) - len(helped)
-        others = f"; without any one of the other {rest} it fails too" if rest else ""
-        return [f"The same seed succeeds without the perturbation {ways}{others}."]
+        others = f"; leaving out one of the other {rest} does not help" if rest else ""
+        return [f"One perturbation less, and the same seed succeeds: {in_a_row(ways, 'or')}{others}."]
     if clean["result"]["is_success"]:
         told = f"The same seed succeeds unperturbed{_steps(clean['result'])}"
         return [f"{told}, but without any single perturbation it fails too: they break it together."]
@@ -98,26 +103,55 @@ def _steps(result: Values) -> str:
     return f" (after {result['steps']} steps)" if "steps" in result else ""
 
 
+def turned_right(result: Values, masked: Mapping[str, Values]) -> list[str]:
+    """Return which changes of what it is given lead a failed episode's stone to the right place."""
+    succeeded, right = turning(result, masked)
+    told = [f"With {_changes(succeeded)} in every step, it succeeds."] if succeeded else []
+    if right:
+        there = _intersection(result["target"])
+        where = f"the stone is put down at the right intersection, {there}"
+        if result["failure"] in PUT_DOWN:
+            where += f", not at {_intersection(result['nearest_intersection'])}"
+        told.append(f"With {_changes(right)} in every step, {where}.")
+    return told
+
+
+def turning(result: Values, masked: Mapping[str, Values]) -> tuple[list[str], list[str]]:
+    """Return the masks under which a failed episode succeeds, and those that only turn it to its target."""
+    if result["is_success"]:
+        return [], []
+    succeeded = [name for name, each in masked.items() if each["is_success"]]
+    others = [] if _is_at_target(result) else [name for name in masked if name not in succeeded]
+    return succeeded, [name for name in others if _is_at_target(masked[name])]
+
+
+def _is_at_target(result: Values) -> bool:
+    """Return True if the stone was put down nearest to the intersection that was named."""
+    if result.get("target") is None or result["failure"] not in PUT_DOWN:
+        return False
+    return tuple(result["nearest_intersection"]) == tuple(result["target"])
+
+
+def _changes(masks: Sequence[str]) -> str:
+    """Return "the stone or the word for row hidden, or another row named,"; without commas if all hide."""
+    hidden = [subject(each) for each in masks if is_hidden(each)]
+    named = [subject(each) for each in masks if not is_hidden(each)]
+    ways = [
+        f"{in_a_row(first_of(names, MAX_NAMES), 'or')} {verb}"
+        for names, verb in ((hidden, "hidden"), (named, "named"))
+        if names
+    ]
+    return ways[0] if len(ways) == 1 else f"{', or '.join(ways)},"
+
+
 def with_masks(masked: Mapping[str, Values]) -> list[str]:
-    """Return which hidden inputs turn the episode's outcome over, where they are hidden in every step."""
-    clean = masked.get("nothing")
+    """Return which hidden inputs make a success fail; of a failure, that none changes where it ends."""
+    clean = masked.get(NOTHING)
     if clean is None:
         return []
-    turned = [name for name, each in masked.items() if each["is_success"] != clean["is_success"]]
-    if not turned:
-        still = "succeeds" if clean["is_success"] else "fails"
-        return [f"Whatever single input is hidden in every step, it still {still}."]
-    ended = "fails" if clean["is_success"] else "succeeds"
-    return [f"It {ended} if any one of these is hidden in every step: {', '.join(map(_mask, turned))}."]
-
-
-def _mask(name: str) -> str:
-    kind, _, rest = name.partition(": ")
-    return {"object": f"the {rest}", "words": word_name(rest)}.get(kind, name)
-
-
-def word_name(name: str) -> str:
-    """Return "the word for row", "the words for row and column", 'the word "black"'."""
-    if name.startswith('"'):
-        return f"the word {name}"
-    return f"the word{'s' if ' and ' in name else ''} for {name.replace('color', 'colour')}"
+    if not clean["is_success"]:
+        return [] if any(turning(clean, masked)) else [f"{WHATEVER}, it still fails."]
+    needed = [subject(name) for name, each in masked.items() if is_hidden(name) and not each["is_success"]]
+    if not needed:
+        return [f"{WHATEVER}, it still succeeds."]
+    return [f"It fails if any one of these is hidden in every step: {', '.join(needed)}."]

@@ -9,10 +9,9 @@ import numpy as np
 from lerobot_bomb.bomb.expert import current_goal
 from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
-from lerobot_bomb.environments import env_type
 from lerobot_bomb.envs.rollout import Moment
-from lerobot_bomb.viewing.episode import Viewed
-from lerobot_bomb.viewing.film import Film, as_jpeg, draw_film
+from lerobot_bomb.viewing.episode import ViewedRun
+from lerobot_bomb.viewing.film import Watch, as_jpeg, run_filmed
 
 CAMERA = "workspace"  # the one that sees the board as a whole
 
@@ -35,28 +34,20 @@ class EpisodeRun:
         }
 
 
-class EpisodeCollector:
-    """Collector of an episode's moments, one after the other, while the environment is in each."""
+def run_for_explanation(run: ViewedRun, with_film: bool, watch: Watch | None = None) -> EpisodeRun:
+    """Run an episode and keep its paths; ``watch`` as in `run_filmed`."""
+    states: list[PrivilegedState] = []
 
-    def __init__(self, viewed: Viewed, env: gymnasium.Env, with_film: bool) -> None:
-        self._viewed, self._env = viewed, env
-        self._states: list[PrivilegedState] = []
-        self._film = Film(env_type(viewed.env_type).view, env) if with_film else None
-
-    def add(self, moment: Moment) -> None:
-        """Add a moment."""
+    def keep(env: gymnasium.Env, moment: Moment) -> None:
         if ENVIRONMENT_STATE in moment.observation:
-            self._states.append(moment.state)
-        if self._film is not None:
-            self._film.add(moment)
+            states.append(moment.state)
+        if watch is not None:
+            watch(env, moment)
 
-    def end(self) -> EpisodeRun:
-        """Return the episode, which has ended."""
-        result = self._env.get_wrapper_attr("episode_result")()
-        film = None if self._film is None else draw_film(self._film, self._viewed, result)
-        return EpisodeRun(
-            result,
-            np.array([each.gripper_xyz for each in self._states]).reshape(-1, 3),
-            np.array([each.stone_xyz[current_goal(each).stone] for each in self._states]).reshape(-1, 3),
-            None if film is None else as_jpeg(film),
-        )
+    result, film = run_filmed(run, keep, with_film)
+    return EpisodeRun(
+        result,
+        np.array([each.gripper_xyz for each in states]).reshape(-1, 3),
+        np.array([each.stone_xyz[current_goal(each).stone] for each in states]).reshape(-1, 3),
+        None if film is None else as_jpeg(film),
+    )

@@ -1,7 +1,7 @@
-"""Episodes in which something is hidden from the policy in every step."""
+"""Episodes in which something is hidden from the policy, or reworded, in every step."""
 
 from collections.abc import Callable, Mapping
-from contextlib import closing
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,15 +10,16 @@ import numpy as np
 import torch
 from lerobot.utils.constants import OBS_IMAGES
 
-from lerobot_bomb.envs.rollout import run_episode
-from lerobot_bomb.explain.film import EpisodeCollector, EpisodeRun
+from lerobot_bomb.envs.rollout import Agent
+from lerobot_bomb.explain.film import EpisodeRun, run_for_explanation
 from lerobot_bomb.explain.images import filling, occluded
+from lerobot_bomb.explain.mask_names import ANOTHER, HIDDEN_WORDS, NOTHING, OBJECT, WHOLE, mask_name
 from lerobot_bomb.explain.other_policies import scored
 from lerobot_bomb.explain.scored_policy import Batch
 from lerobot_bomb.explain.snapshots import Snapshot
 from lerobot_bomb.explain.spans import TOKENIZERS, Span, named_spans, token_offsets, whole
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
-from lerobot_bomb.viewing.episode import Viewed
+from lerobot_bomb.viewing.episode import Viewed, ViewedRun
 
 # observation and environment -> what the policy gets in its place
 type Change = Callable[[Batch, gymnasium.Env], Batch]
@@ -35,7 +36,7 @@ def nothing(batch: Batch, _: gymnasium.Env | str) -> Batch:
 
 @dataclass(frozen=True)
 class Mask:
-    """Changes that hide something from the policy, before and after the preprocessor."""
+    """Changes of what the policy is given, before and after the preprocessor."""
 
     change: Change = nothing
     change_prepared: PreparedChange = nothing
@@ -73,17 +74,29 @@ def without_words(loaded: LoadedPolicy, words: Callable[[str], Span | None]) -> 
     return Mask(change_prepared=hide)
 
 
+def with_other_words(others: Mapping[str, str]) -> Mask:
+    """Give the policy other instructions; ``others``: instruction -> the one in its place."""
+
+    def change(batch: Batch, _: gymnasium.Env) -> Batch:
+        return {**batch, "task": [others.get(each, each) for each in batch["task"]]}
+
+    return Mask(change=change)
+
+
 def masks_of(snapshot: Snapshot, loaded: LoadedPolicy, fill: str) -> dict[str, Mask]:
-    """Return the masks: nothing, kinds of objects, words for row, column and colour, all words."""
-    masks = {"nothing": Mask()}
+    """Return the masks: nothing, each object, words for row, column and colour, all words, other words."""
+    masks = {NOTHING: Mask()}
     masks |= {
-        f"object: {name}": without_object(name, fill) for name in next(iter(snapshot.objects.values()), {})
+        mask_name(OBJECT, name): without_object(name, fill)
+        for name in next(iter(snapshot.objects.values()), {})
     }
     if any(isinstance(step, TOKENIZERS) for step in loaded.prepare.steps):
         for span in named_spans(snapshot.instruction, snapshot.instructions):
             by_instruction = {snapshot.instruction: span}
-            masks[f"words: {span.name}"] = without_words(loaded, by_instruction.get)
-        masks["the whole instruction"] = without_words(loaded, whole)
+            masks[mask_name(HIDDEN_WORDS, span.name)] = without_words(loaded, by_instruction.get)
+        masks[WHOLE] = without_words(loaded, whole)
+        for word, other in snapshot.instructions.items():
+            masks[mask_name(ANOTHER, word)] = with_other_words({snapshot.instruction: other})
     return masks
 
 
@@ -95,15 +108,14 @@ def run_masked(viewed: Viewed, loaded: LoadedPolicy, masks: Mapping[str, Mask]) 
 def run_under(viewed: Viewed, loaded: LoadedPolicy, mask: Mask, with_film: bool = False) -> EpisodeRun:
     """Run an episode under a mask."""
     loaded.begin()
-    with closing(viewed.make_env()) as env:
-        collector = EpisodeCollector(viewed, env, with_film)
 
+    def masked(env: gymnasium.Env) -> AbstractContextManager[Agent]:
         def act(observation: dict[str, Any], instruction: str) -> np.ndarray:
             batch = mask.change(loaded.observe([observation], [instruction]), env)
             with torch.inference_mode():
                 prepared = mask.change_prepared(loaded.prepare(batch), instruction)
             return loaded.act(prepared)[0]
 
-        for moment in run_episode(env, viewed.spec, act):
-            collector.add(moment)
-        return collector.end()
+        return nullcontext(act)
+
+    return run_for_explanation(ViewedRun(viewed, masked), with_film)

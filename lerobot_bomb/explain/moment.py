@@ -3,52 +3,21 @@
 Shapes: `G` cells along a side of the grid over an image, `L` layers.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from lerobot.utils.constants import OBS_IMAGE, OBS_IMAGES
+from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
-from lerobot_bomb.explain.activations import all_heads, all_layers, all_mlps
 from lerobot_bomb.explain.images import filling, occluded, patch_masks
 from lerobot_bomb.explain.limits import ALL
+from lerobot_bomb.explain.moment_query import MomentQuery
 from lerobot_bomb.explain.next_actions import NextActions
+from lerobot_bomb.explain.patching import PatchingResult, corruptions, restore
 from lerobot_bomb.explain.question import Question
-from lerobot_bomb.explain.restoration import Corruption
-from lerobot_bomb.explain.scored_policy import INSTRUCTION, Batch, Rows, TokenSpan
-from lerobot_bomb.explain.spans import Range, Span
-
-PATCH, WORDS, OTHER_INSTRUCTION = "patch", "words", "other instruction"
-OTHER_SCENE = "scene of another episode"  # its images and state, under this one's instruction
-OBSERVATION = "observation"
-
-
-@dataclass(frozen=True)
-class MomentQuery:
-    """Query about a moment: changes to make, one by one, to measure their effects."""
-
-    grid: int  # cells along a side of each image
-    fill: str  # of FILLINGS
-    spans: Sequence[Span]  # of the instruction
-    offsets: Sequence[Range]  # of its tokens, as `token_offsets` gives them; () without an instruction
-    others: Mapping[str, str] = field(default_factory=dict)  # other instructions, by what they change
-    # {key of an image: {what: (H, W) bool}}
-    objects: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
-    # images (1, 3, H, W) and state of another episode's moment; {}: none is at hand
-    other_scene: Batch = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class PatchingResult:
-    """Result of activation patching: R (see `restoration`) of all units for a corruption, or NaN."""
-
-    corruption: str
-    drop: float  # of the score
-    places: dict[str, list[float]]  # by place in the sequence: (L,) of the layers' states there
-    heads: list[list[float]]  # (L, heads)
-    mlps: list[float]  # (L,)
+from lerobot_bomb.explain.scored_policy import Batch
 
 
 @dataclass(frozen=True)
@@ -89,6 +58,13 @@ class Explanation:
         """Largest shown effect of a patch of any image: maps of one moment have one scale."""
         return max(float(map_GG.max()) for map_GG in self.measured.patches.values())
 
+    @property
+    def largest(self) -> float:
+        """Largest shown effect of a patch, an object in all cameras, or a word hidden or changed."""
+        shown = self.measured
+        effects = (*shown.objects.get(ALL, {}).values(), *shown.words.values(), *shown.others.values())
+        return max(self.largest_patch, *(effect for effect in effects if effect == effect), 0.0)
+
     def as_json(self) -> dict[str, Any]:
         """Return the explanation as JSON values; NaN becomes None."""
         moved = self.moved_mm
@@ -123,7 +99,7 @@ def explain(question: Question, query: MomentQuery, actions: NextActions | None 
     patches = {key: _patches(question, query.grid, key, each) for key, each in fillings.items()}
     words = _words(question, query)
     others = _others(question, query)
-    corruptions = _corruptions(question, query, fillings, patches, words, others)
+    corrupted = corruptions(question, query, fillings, patches, words, others)
     return Explanation(
         unit=question.policy.unit,
         clean_score=question.clean_score,
@@ -131,7 +107,7 @@ def explain(question: Question, query: MomentQuery, actions: NextActions | None 
         objects=_objects(question, query, fillings),
         words=words,
         others=others,
-        restored=[_restore(question, query, name, rows) for name, rows in corruptions],
+        restored=[restore(question, query, each, actions) for each in corrupted],
         moved_mm=None if actions is None else _moved(question, query, fillings, actions),
     )
 
@@ -164,11 +140,6 @@ def image_keys(question: Question) -> list[str]:
         for key, value in sorted(question.observation.items())
         if key.startswith(OBS_IMAGE) and isinstance(value, Tensor) and value.ndim == 4
     ]
-
-
-def camera_name(key: str) -> str:
-    """Return 'workspace' for 'observation.images.workspace'."""
-    return key.removeprefix(f"{OBS_IMAGES}.").removeprefix(f"{OBSERVATION}.")
 
 
 def _filling(question: Question, query: MomentQuery, key: str) -> Tensor:
@@ -221,68 +192,3 @@ def _others(question: Question, query: MomentQuery) -> dict[str, float]:
     return dict(
         zip(query.others, question.effects_of_instructions([*query.others.values()]).tolist(), strict=True)
     )
-
-
-def _corruptions(
-    question: Question,
-    query: MomentQuery,
-    fillings: Mapping[str, Tensor],
-    patches: Mapping[str, Tensor],
-    words: Mapping[str, float],
-    others: Mapping[str, float],
-) -> list[tuple[str, Rows]]:
-    """Return (name, rows): the strongest patch, span and other instruction, and another episode's scene."""
-    if not question.policy.layers:
-        return []
-    found = []
-    key = max(patches, key=lambda name: float(patches[name].max()))
-    cell = int(patches[key].argmax())
-    (image,) = question.observation[key]
-    mask = patch_masks(query.grid, *image.shape[1:])[cell : cell + 1].to(image.device)
-    name = f"{camera_name(key)} {PATCH} {cell // query.grid}, {cell % query.grid} taken out"
-    found.append((name, question.encode({key: occluded(image, mask, fillings[key])}, 1)))
-    if words:
-        span = max(query.spans, key=lambda each: words[each.name])
-        rows = question.policy.hide(question.rows, span.tokens(query.offsets)[None])
-        found.append((f"{WORDS} {span.name} hidden", rows))
-    if others:
-        other = max(others, key=lambda each: others[each])
-        rows = question.encode({"task": [query.others[other]]}, 1)
-        if _has_columns_of(rows, question.rows):
-            found.append((f"{OTHER_INSTRUCTION}: {query.others[other]!r}", rows))
-    if query.other_scene:
-        found.append((OTHER_SCENE, question.encode(query.other_scene, 1)))
-    return found
-
-
-def _has_columns_of(rows: Rows, others: Rows) -> bool:
-    """Return True if rows have as many tokens, and the same padding: states are put back token by token."""
-    return all(
-        value.shape == others[key].shape and (value.dtype != torch.bool or value.equal(others[key]))
-        for key, value in rows.items()
-    )
-
-
-def _token_spans(question: Question, query: MomentQuery, rows: Rows) -> dict[str, TokenSpan]:
-    """Return the spans of the prompt's parts and words; {} where the layers' states cannot be put back."""
-    if any(layer.layer is None for layer in question.policy.layers):
-        return {}
-    spans = question.policy.token_spans(rows)
-    first, *later = spans.get(INSTRUCTION, (None,))
-    if not isinstance(first, Tensor):
-        return spans
-    words = {span.name: span.tokens(query.offsets) for span in query.spans}
-    return spans | {name: (first[tokens], *later) for name, tokens in words.items()}
-
-
-def _restore(question: Question, query: MomentQuery, name: str, rows: Rows) -> PatchingResult:
-    corruption = Corruption(question, rows)
-    layers = question.policy.layers
-    by_span = {
-        span: corruption.restore_each(all_layers(len(layers), columns)).tolist()
-        for span, columns in _token_spans(question, query, rows).items()
-    }
-    heads = corruption.restore_each(all_heads(layers)).split([layer.num_heads for layer in layers])
-    mlps = corruption.restore_each(all_mlps(len(layers)))
-    drop = question.clean_score - corruption.score
-    return PatchingResult(name, drop, by_span, [each.tolist() for each in heads], mlps.tolist())

@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.film import CAMERA
 from lerobot_bomb.explain.maps import tinted
-from lerobot_bomb.explain.moment import camera_name
+from lerobot_bomb.explain.moment_query import camera_name
 from lerobot_bomb.viewing.rerun_file import STEP, open_recording, png
 
 

@@ -1,7 +1,7 @@
 """Snapshots of an episode in which a policy acts, and the moments to explain."""
 
 from collections.abc import Mapping
-from contextlib import closing
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,11 +13,11 @@ from lerobot_bomb.bomb.camera import PinholeCamera
 from lerobot_bomb.bomb.expert import current_goal
 from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
-from lerobot_bomb.envs.rollout import Moment, run_episode
-from lerobot_bomb.explain.film import EpisodeCollector, EpisodeRun
+from lerobot_bomb.envs.rollout import Moment
+from lerobot_bomb.explain.film import EpisodeRun, run_for_explanation
 from lerobot_bomb.explain.phases import PHASES, gripper_does, phases_of
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
-from lerobot_bomb.viewing.episode import Viewed
+from lerobot_bomb.viewing.episode import Viewed, ViewedRun
 
 
 @dataclass(frozen=True)
@@ -51,17 +51,16 @@ class Snapshot:
 def take_snapshots(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Snapshot], EpisodeRun]:
     """Return every moment in which the policy acts, and the episode as it ran."""
     loaded.begin()
-    with closing(viewed.make_env()) as env:
+    taken: list[Snapshot] = []
 
-        def act(observation: dict[str, Any], instruction: str) -> np.ndarray:
-            return loaded.agent([observation], [instruction])[0]
+    def act(observation: dict[str, Any], instruction: str) -> np.ndarray:
+        return loaded.agent([observation], [instruction])[0]
 
-        collector, taken = EpisodeCollector(viewed, env, with_film=True), []
-        for moment in run_episode(env, viewed.spec, act):
-            collector.add(moment)
-            if moment.action is not None:
-                taken.append(_snapshot(moment, env))
-        run = collector.end()
+    def take(env: gymnasium.Env, moment: Moment) -> None:
+        if moment.action is not None:
+            taken.append(_snapshot(moment, env))
+
+    run = run_for_explanation(ViewedRun(viewed, lambda _: nullcontext(act)), with_film=True, watch=take)
     if taken[0].state is None:
         return taken, run
     states = [each.state for each in taken if each.state is not None]

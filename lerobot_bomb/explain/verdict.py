@@ -5,6 +5,7 @@ It reads the values of `explanation.json`, of one episode or of several.
 
 from collections.abc import Iterator, Sequence
 
+from lerobot_bomb.bomb.board import HALVES
 from lerobot_bomb.explain.aggregate import means_of
 from lerobot_bomb.explain.effects import (
     BOTH,
@@ -22,15 +23,15 @@ from lerobot_bomb.explain.facts import (
     as_recorded,
     count_outcomes,
     outcome,
+    turned_right,
     with_masks,
     without_perturbations,
-    word_name,
 )
-from lerobot_bomb.explain.limits import RESTORES, SHARE, SMALLEST_MM, smallest_drop
+from lerobot_bomb.explain.limits import MAX_NAMES, RESTORES, SHARE, SMALLEST_MM, smallest_drop
+from lerobot_bomb.explain.mask_names import word_name
 from lerobot_bomb.tables import first_of, in_a_row
 
-STONE = "stone"
-MAX_NAMES = 4  # that a sentence lists
+STONE, BOARD_ITSELF = "stone", "board"
 
 
 def verdict(episodes: Sequence[Values]) -> list[str]:
@@ -44,19 +45,31 @@ def _endings(episodes: Sequence[Values]) -> Iterator[str]:
         yield count_outcomes([each["result"] for each in episodes])
         return
     (episode,) = episodes
+    masked = episode.get("masked_episodes", {})
+    yield from turned_right(episode["result"], masked)  # the best clue there is to a failure
     yield outcome(episode["result"])
     yield from as_recorded(episode["result"], episode.get("recorded"))
     yield from without_perturbations(episode.get("counterfactuals", ()))
-    yield from with_masks(episode.get("masked_episodes", {}))
+    yield from with_masks(masked)
 
 
 def reasons(moments: Sequence[Values]) -> list[str]:
     """Return what the policy's actions depend on in these moments, sentence by sentence."""
-    objects, patches = effects_of(moments, OBJECTS), effects_of(moments, PATCHES)
+    objects, patches = _distinct(effects_of(moments, OBJECTS)), effects_of(moments, PATCHES)
     steps = "the one step examined" if len(moments) == 1 else f"the {len(moments)} steps examined"
     seen = _objects(objects, steps) if objects else _patches(patches)
     words = _words(effects_of(moments, WORDS), objects or patches)
     return [*seen, *words, *_followed(moments), *_pointing(moments), *_heads(moments)]
+
+
+def _distinct(objects: Sequence[Effect]) -> list[Effect]:
+    """Leave one of the board and its halves: a half that matters as much as all of it, else the board."""
+    halves = [each for each in objects if each.name in HALVES and each.matters]
+    board = next((each for each in objects if each.name == BOARD_ITSELF), None)
+    if board is None or not halves:
+        return [each for each in objects if each.name not in HALVES]
+    shown = halves[0] if halves[0].size >= board.size or not board.matters else board
+    return [each for each in objects if each is shown or each.name not in (BOARD_ITSELF, *HALVES)]
 
 
 def _changed(effect: Effect) -> str:
@@ -201,8 +214,7 @@ def _restored(phase_moments: tuple[str, list[Values]]) -> tuple[float, str, dict
         restored
         for moment in moments
         for restored in moment["restored"]
-        if "instruction" in restored["corruption"]
-        and abs(restored["drop"]) > smallest_drop(moment["clean_score"])
+        if "instruction" in restored["corruption"] and _is_felt(restored, moment)
     ]
     rows = [
         {
@@ -214,6 +226,13 @@ def _restored(phase_moments: tuple[str, list[Values]]) -> tuple[float, str, dict
     ]
     drop = sum(abs(each["drop"]) for each in found) / len(found) if found else 0.0
     return drop, phase, {name: mean.value for name, mean in means_of(known(rows)).items()}
+
+
+def _is_felt(restored: Values, moment: Values) -> bool:
+    """Return True if a corruption changes the next action, or where that is no distance, the score."""
+    if restored["moved_mm"] is not None:
+        return restored["moved_mm"] > SMALLEST_MM
+    return abs(restored["drop"]) > smallest_drop(moment["clean_score"])
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -18,9 +18,10 @@ from lerobot_bomb.hub.history import NO_NAME, History
 from lerobot_bomb.hub.limits import limits
 from lerobot_bomb.hub.markdown import code, command, fenced, plain
 from lerobot_bomb.hub.method import BOMB, Method
-from lerobot_bomb.hub.rates import FIGURE, figure, headline, results_table
+from lerobot_bomb.hub.rates import FIGURE, headline, rates_chart, results_table
 from lerobot_bomb.hub.training import peft_flags, train_command
 from lerobot_bomb.hub.usage import how_to_use, in_python
+from lerobot_bomb.report.chart import standalone
 from lerobot_bomb.results.groups import Group, groups_of
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.vlm.tokenizer import NANO
@@ -69,8 +70,8 @@ class Checkpoint:
         return PolicyCard(f"---\n{self._metadata().to_yaml()}\n---\n\n{self._text()}")
 
     def figure(self) -> bytes | None:
-        """Return the PNG that the card shows; None if it has no rates."""
-        return figure(self._groups) if self.results else None
+        """Return the SVG that the card shows; None if it has no rates."""
+        return standalone(rates_chart(self._groups).svg).encode() if self.results else None
 
     @cached_property
     def history(self) -> History:
@@ -145,10 +146,17 @@ class Checkpoint:
             f"A checkpoint of LeRobot's policy type `{self.config.type}`, which the plugin "
             f"`lerobot_policy_bomb` adds{self._size()}. {self._weights()}{benchmark}",
             *(f"Success on {headline(group)}" for group in self._groups),
-            *([f"![Success rate by condition, as in the table below]({FIGURE})"] if self._groups else []),
+            *self._figure_text(),
             f"The policy type: {self.method.summary}{self._methods_used()}",
         ]
         return "\n\n".join(paragraphs)
+
+    def _figure_text(self) -> list[str]:
+        """Return the figure and its note, as Markdown; [] without rates."""
+        if not self._groups:
+            return []
+        image = f"![Success by condition, as in the table below]({FIGURE})"
+        return [image, plain(rates_chart(self._groups).note)]
 
     def _size(self) -> str:
         if self.num_parameters is None:

@@ -1,5 +1,6 @@
 """Publishing of a recorded dataset, with its card, on the Hub."""
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,7 +18,13 @@ from lerobot_bomb.hub.markdown import code, command, fenced, plain
 from lerobot_bomb.hub.method import BOMB
 from lerobot_bomb.hub.push import CARD
 from lerobot_bomb.hub.upload import check_token, hub_errors, upload
+from lerobot_bomb.report.cells import count
+from lerobot_bomb.report.chart import standalone
+from lerobot_bomb.report.sections.failures import stacked
+from lerobot_bomb.report.table import Cell, Table
+from lerobot_bomb.stats import format_rate
 
+FIGURE, FIGURE_TITLE = "outcomes.svg", "How the expert's episodes ended"
 FOLDERS = ("meta", "data", "videos")
 
 
@@ -32,6 +39,13 @@ class RecordedDataset:
     @property
     def card(self) -> str:
         return dataset_card(self.repo_id, self.facts)
+
+    @property
+    def contents(self) -> dict[str, Path | bytes]:
+        """Return all that is published, by name on the Hub."""
+        drawn = figure(self.facts)
+        figures = {} if drawn is None else {FIGURE: drawn}
+        return {**self.files, CARD: self.card.encode(), **figures}
 
 
 def read_dataset(root: Path, repo_id: str) -> RecordedDataset:
@@ -65,17 +79,16 @@ def publish_dataset(dataset: RecordedDataset, private: bool | None) -> CommitInf
     """
     check_token()
     info = dataset.facts.info
-    files: dict[str, Path | bytes] = {**dataset.files, CARD: dataset.card.encode()}
     message = f"{info['total_episodes']} episodes and card"
-    commit = upload(dataset.repo_id, "dataset", files, _is_data, message, private=private)
+    commit = upload(dataset.repo_id, "dataset", dataset.contents, _is_data, message, private=private)
     with hub_errors(dataset.repo_id):
         _tag(dataset.repo_id, info["codebase_version"])
     return commit
 
 
 def _is_data(path: str) -> bool:
-    """Return True for a file that LeRobot reads, so that none is left of a longer recording."""
-    return path.split("/")[0] in FOLDERS
+    """Return True for a figure, or a file that LeRobot reads: none is left of another recording."""
+    return path == FIGURE or path.split("/")[0] in FOLDERS
 
 
 def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
@@ -97,10 +110,45 @@ def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
     lines = "\n".join(map(plain, facts.lines()))
     start = (
         f"# {repo_id.split('/')[-1]}\n\nA LeRobotDataset {facts.info['codebase_version']}, {written} by "
-        f"`lerobot-bomb`.\n\n{lines}\n"
+        f"`lerobot-bomb`.\n\n{_outcomes_text(facts)}{lines}\n"
     )
     text = start + "".join(f"\n## {title}\n\n{section}\n" for title, section in sections.items())
     return f"---\n{metadata.to_yaml()}\n---\n\n{text}"
+
+
+def _outcomes(facts: DatasetFacts) -> Table | None:
+    """Count how the expert's episodes ended, as a report does; None where the expert did not act."""
+    if not _is_of_expert(facts):
+        return None
+    failures = Counter(each["failure"] for each in facts.bomb.get("failures", []))
+    names = [name for name, _ in failures.most_common()]
+    kept = facts.bomb["num_episodes"]
+    total = kept + failures.total()
+    row = [Cell("the expert's episodes"), Cell(str(total), total)]
+    row += [count(number, total) for number in (kept, *(failures[name] for name in names))]
+    return Table("", ["", "episodes", "success", *names], [row])
+
+
+def _is_of_expert(facts: DatasetFacts) -> bool:
+    """Return True if the scripted expert ran the episodes: no other policy did, and they are no scenes."""
+    recording = facts.recording
+    return bool(recording) and not recording.get("relabel") and not recording.get("static")
+
+
+def _outcomes_text(facts: DatasetFacts) -> str:
+    """Return the expert's rate of success in a sentence, and the figure, as Markdown."""
+    table = _outcomes(facts)
+    if table is None:
+        return ""
+    _, total, kept, *_ = (cell.value for cell in table.rows[0])
+    rate = f"The scripted expert succeeded in {format_rate(kept, total)} of the episodes it ran"
+    return f"{rate}; its successes are the dataset.\n\n![{FIGURE_TITLE}]({FIGURE})\n\n"
+
+
+def figure(facts: DatasetFacts) -> bytes | None:
+    """Draw how the expert's episodes ended, as an SVG file; None where the expert did not act."""
+    table = _outcomes(facts)
+    return None if table is None else standalone(stacked(FIGURE_TITLE, table.header[2:], table)).encode()
 
 
 def _use(repo_id: str, facts: DatasetFacts) -> str:
@@ -124,7 +172,8 @@ def _limits(facts: DatasetFacts) -> Iterator[str]:
     if shown == [NONE]:
         yield "Perturbed scenes: all are unperturbed."
     if facts.recording:
-        yield "Failed episodes: the scripted expert's successes alone were kept."
+        if _is_of_expert(facts):
+            yield "Failed episodes: the scripted expert's successes alone were kept."
         yield "A robot's own data: all of it is simulated."
     if facts.conversion:
         yield f"A licence: that of its source holds ({plain(facts.conversion['source'])})."

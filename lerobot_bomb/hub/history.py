@@ -8,11 +8,11 @@ from typing import Any
 from lerobot_bomb.checkpoints.checks import ADAPTERS
 from lerobot_bomb.checkpoints.identity import sha256_of
 from lerobot_bomb.checkpoints.names import CONFIG, WEIGHTS, is_hub_id, local_file
-from lerobot_bomb.checkpoints.shipped import shipped_name
 from lerobot_bomb.checkpoints.training import dataset_of, read_train_config
 from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.files import read_json
 from lerobot_bomb.hub.markdown import code, plain
+from lerobot_bomb.results.names import shipped_name
 
 UNKNOWN = "not known"
 NO_NAME = "CHECKPOINT"  # stands in a command for a checkpoint that no other machine has

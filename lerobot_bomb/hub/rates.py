@@ -1,24 +1,18 @@
 """Success rates on a card: a sentence, a figure and a table."""
 
-import io
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.hub.markdown import code, plain
+from lerobot_bomb.report.chart import Chart
+from lerobot_bomb.report.report import Report
+from lerobot_bomb.report.sections import answer
 from lerobot_bomb.results.groups import Group, by_condition, rate_of
 from lerobot_bomb.results.record import NO_VALUE, Record
 from lerobot_bomb.results.summary import named_counts, summarise
 from lerobot_bomb.stats import Rate
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-FIGURE = "success_rates.png"  # beside the card: the Hub drops SVG that stands in it
-MAX_ROWS = 30  # conditions of a group in the figure: the unperturbed one, then those with the lowest rates
-MAX_TITLE = 70  # characters
-ROW_INCHES, WIDTH_INCHES, DPI = 0.24, 7.0, 150
-DOT_RGB, GRID_RGB = "#0072B2", "#DDDDDD"  # Okabe-Ito's blue
+FIGURE = "success_rates.svg"  # beside the card: the Hub drops SVG that stands in it
 
 type Rates = dict[str, Rate]  # {condition: rate}
 
@@ -44,43 +38,10 @@ def headline(group: Group) -> str:
     return f"{plain(_title(group))}: {'; '.join(parts)} ({methods})."
 
 
-def figure(groups: Sequence[Group]) -> bytes:
-    """Draw each condition's rate with its interval, one panel for each group, as a PNG."""
-    from matplotlib.figure import Figure
-
-    shown = [dict(list(rates_of(group).items())[:MAX_ROWS]) for group in groups]
-    heights = [len(rates) + 3 for rates in shown]
-    drawing = Figure(figsize=(WIDTH_INCHES, ROW_INCHES * sum(heights) + 0.3), dpi=DPI, layout="constrained")
-    panels = drawing.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]
-    for panel, group, rates in zip(panels, groups, shown, strict=True):
-        _draw(panel, rates)
-        left_out = len(by_condition(group.records)) - len(rates)
-        note = f" ({left_out} conditions with higher rates are not shown)" if left_out else ""
-        panel.set_title(_cut(_title(group)) + note, fontsize=9, loc="left", parse_math=False)
-    panels[-1].set_xlabel("success, %, with 95 % interval", fontsize=8)
-    file = io.BytesIO()
-    drawing.savefig(file, format="png")
-    return file.getvalue()
-
-
-def _draw(panel: "Axes", rates: Rates) -> None:
-    places = range(len(rates))
-    for place, rate in zip(places, rates.values(), strict=True):
-        low, high = rate.interval or (rate.share, rate.share)
-        panel.plot([100 * low, 100 * high], [place, place], color=DOT_RGB, linewidth=1.5)
-        panel.plot(100 * rate.share, place, "o", color=DOT_RGB, markersize=5, clip_on=False)
-        panel.annotate(
-            f"{rate.successes}/{rate.n}", (1.02, place), fontsize=8, va="center",
-            xycoords=panel.get_yaxis_transform(),
-        )  # fmt: skip
-    panel.set_yticks(places, ["unperturbed" if name == NONE else _cut(name) for name in rates], fontsize=8)
-    panel.set_xlim(0, 100)
-    panel.set_ylim(len(rates) - 0.5, -0.5)
-    panel.tick_params(axis="x", labelsize=8)
-    panel.tick_params(axis="y", length=0)
-    panel.grid(axis="x", color=GRID_RGB, linewidth=0.6)
-    panel.set_axisbelow(True)
-    panel.spines[["top", "right", "left"]].set_visible(False)
+def rates_chart(groups: Sequence[Group]) -> Chart:
+    """Return the report's chart of each condition's rate with its interval."""
+    (chart,) = answer.section(Report([*groups])).charts
+    return chart
 
 
 def results_table(group: Group) -> str:
@@ -129,7 +90,3 @@ def suite_or_task(record: Record) -> str:
 def _title(group: Group) -> str:
     first = group.records[0]
     return f"{first.benchmark()}, {suite_or_task(first)}"
-
-
-def _cut(text: str) -> str:
-    return text if len(text) <= MAX_TITLE else f"{text[: MAX_TITLE - 1]}…"

@@ -21,6 +21,8 @@ MARKERS = "osD^vPX"
 MAX_SERIES = 6  # that a chart can show side by side
 MAX_BARS = 80  # below each other
 WIDTH = 9.6  # inches: what a page shows without scrolling
+NAMESPACES = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
+PAPER = "color:#222;background:#fff;"
 STYLE = {
     "svg.fonttype": "none",
     "font.size": 9,
@@ -78,6 +80,12 @@ def _inline(svg: str, title: str, size: tuple[float, float]) -> str:
         f'<svg role="img" viewBox="0 0 {width:g} {height:g}" '
         f'style="width:{pixels}px;min-width:min(46rem,{pixels}px)"><title>{escape(title)}</title>{body}'
     )
+
+
+def standalone(svg: str) -> str:
+    """Return a chart's SVG as a file of its own, on white: a page's own colours do not reach an image."""
+    named = svg.replace("<svg ", f"<svg {NAMESPACES} ", 1)
+    return named.replace('style="', f'style="{PAPER}', 1)
 
 
 def chart_text(name: str) -> str:

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SIZE_INCHES = (7.6, 4.4)
+BOARD_INCHES = 3.7  # what a phone shows without scrolling
+LINE_INCHES = 0.19  # of the legend
 LABEL_M = 0.022  # of the numbers beside the board, beyond its outer lines
 DASHES = ("-", "--", ":", "-.")
 
@@ -51,7 +52,7 @@ def paths_chart(title: str, runs: Mapping[str, EpisodeRun], target_xy: Sequence[
         _paint_board(axes, target_xy)
         for number, (name, run) in enumerate(runs.items()):
             _paint_path(axes, number, name, run)
-        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        figure.legend(loc="outside lower left")  # beside the board, it would be off a phone's screen
 
     rows = [
         [Cell(name), Cell(ending(run)), Cell(str(len(run.gripper_xyz) - 1)), *_last_xy(run)]
@@ -59,7 +60,8 @@ def paths_chart(title: str, runs: Mapping[str, EpisodeRun], target_xy: Sequence[
     ]
     header = ["episode", "outcome", "steps", "stone at the end, x mm", "y mm"]
     note = "From above: lines are the gripper's path, dots where the stone ended, the ring is the target."
-    return Chart(title, draw(title, SIZE_INCHES, paint), [Table("", header, rows)], note)
+    size = (BOARD_INCHES, BOARD_INCHES + LINE_INCHES * (len(runs) + 1))
+    return Chart(title, draw(title, size, paint), [Table("", header, rows)], note)
 
 
 def _last_xy(run: EpisodeRun) -> list[Cell]:

@@ -10,9 +10,11 @@ import numpy as np
 from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.limits import SMALLEST_MM, smallest_drop
 from lerobot_bomb.explain.maps import STRENGTH, TINT_RGB, data_url, strength, tinted
-from lerobot_bomb.explain.moment import OTHER_INSTRUCTION, OTHER_SCENE, WORDS, PatchingResult, camera_name
+from lerobot_bomb.explain.moment_query import camera_name
+from lerobot_bomb.explain.patching import OTHER_INSTRUCTION, OTHER_SCENE, WORDS, PatchingResult
 from lerobot_bomb.explain.spans import spans_of_words
 from lerobot_bomb.report.chart import INK, Chart, draw
+from lerobot_bomb.report.table import Section
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,35 +22,33 @@ if TYPE_CHECKING:
 
 SHOWN = "width:min(14rem,40vw)"  # of a picture: two beside each other on a phone
 PANEL_INCHES = 1.9
+HEADS_TITLE = "Layers and heads"
 # of corruptions: rows of the figure
 KINDS = ("hidden patch", "hidden words", "other words", "other scene")
 
 
+def largest_effect(moments: Sequence[ExplainedMoment]) -> float:
+    """Return the largest effect that the verdict can name: where the page's one scale of colours ends."""
+    return max(each.explanation.largest for each in moments)
+
+
 def maps_html(moments: Sequence[ExplainedMoment]) -> str:
     """Return images and words of each moment, tinted by their effects, all in one scale."""
-    largest = max(map(_largest, moments))
+    largest = largest_effect(moments)
     figures = "".join(_moment(each, largest) for each in moments)
     grid = f'<div style="display:flex;flex-wrap:wrap;gap:1rem;align-items:start">{figures}</div>'
-    return f"{_scale(moments[0], largest)}{grid}"
+    return f"{scale_html(moments[0].explanation.measured_unit, largest)}{grid}"
 
 
-def _largest(moment: ExplainedMoment) -> float:
-    found = moment.explanation
-    words = [effect for name, effect in found.measured.words.items() if name.startswith('"')]
-    return max([found.largest_patch, *words])
-
-
-def _scale(moment: ExplainedMoment, largest: float) -> str:
-    unit = moment.explanation.measured_unit
-    what = (
-        "how far the next action moves when the patch or word is hidden"
-        if unit == "mm"
-        else "how far the score of the policy's answer drops when the patch or word is hidden"
-    )
+def scale_html(unit: str, largest: float) -> str:
+    """Return the scale of the colours: their unit, what they measure, where it ends."""
+    moves = "how far the next action moves" if unit == "mm" else "how far the score of the answer drops"
+    what = f"{moves} when the patch or word is hidden"
     shades = f"linear-gradient(90deg,transparent,rgba{(*TINT_RGB, STRENGTH)})"
     look = f"display:inline-block;width:9rem;height:.9em;border:1px solid #8888;background:{shades}"
-    top = f"{largest:.3g} {escape(unit)}"
-    return f'<p class="note">0 <span style="{look}"></span> {top}: {what}. One scale for all.</p>'
+    top = escape(amount(largest, unit))
+    scale = "The scale ends at the largest effect of any patch, object or word on this page"
+    return f'<p class="note">0 <span style="{look}"></span> {top}: {what}. {scale}.</p>'
 
 
 def _moment(moment: ExplainedMoment, largest: float) -> str:
@@ -56,7 +56,8 @@ def _moment(moment: ExplainedMoment, largest: float) -> str:
     images = "".join(
         f'<img src="{data_url(tinted(patches[key].numpy(), largest, image))}" style="width:100%" '
         f'alt="{escape(f"{camera_name(key)} at {moment.title}, tinted by the effects of its patches")}">'
-        f"<div>{escape(camera_name(key))}</div>"
+        f"<div>{escape(camera_name(key))}, at most "
+        f"{escape(amount(float(patches[key].max()), moment.explanation.measured_unit))}</div>"
         for key, image in moment.images.items()
     )
     does = f"<div>it {escape(moment.snapshot.does)}</div>" if moment.snapshot.does else ""
@@ -70,7 +71,7 @@ def _words(moment: ExplainedMoment, largest: float) -> str:
     effects = found.measured.words
     if not effects:
         return ""
-    smallest = SMALLEST_MM if found.moved_mm is not None else smallest_drop(found.clean_score)
+    smallest = _smallest(moment)
     instruction, end, parts = moment.snapshot.instruction, 0, []
     for span in spans_of_words(instruction):
         first, last = span.ranges[0]
@@ -86,30 +87,65 @@ def _words(moment: ExplainedMoment, largest: float) -> str:
     return f"<p>{''.join(parts)}{escape(instruction[end:])}</p>"
 
 
-def heads_chart(moments: Sequence[ExplainedMoment]) -> Chart | None:
-    """Draw what each head and MLP brings back: moments side by side, corruptions below each other."""
+def heads_section(moments: Sequence[ExplainedMoment]) -> Section | None:
+    """Write the section of heads and MLPs that bring back what a change takes away; None without layers."""
     kinds = [kind for kind in KINDS if any(_restored(each, kind) for each in moments)]
     if not kinds:
         return None
-    title = "What single heads and MLPs bring back"
+    drawn = [kind for kind in kinds if any(_matters(each, kind) for each in moments)]
+    left = [kind for kind in kinds if kind not in drawn]
+    note = (
+        f"No single head or MLP brings back what these changes take away: {', '.join(left)}." if left else ""
+    )
+    if not drawn:
+        return Section(HEADS_TITLE, [], [], f'<p class="statement">{escape(note)}</p>')
+    return Section(HEADS_TITLE, [], charts=[_heads_chart(moments, drawn, note)])
+
+
+def _heads_chart(moments: Sequence[ExplainedMoment], kinds: Sequence[str], left_out: str) -> Chart:
+    """Draw what each head and MLP brings back: moments side by side, kinds of changes below each other."""
+    title, largest = "What single heads and MLPs bring back", largest_effect(moments)
 
     def paint(figure: "Figure") -> None:
         grid = figure.subplots(len(kinds), len(moments), squeeze=False)
         for row, kind in enumerate(kinds):
             for column, moment in enumerate(moments):
-                _paint_heads(grid[row][column], _restored(moment, kind))
+                _paint_heads(grid[row][column], moment, kind, largest)
                 if row == 0:
-                    grid[row][column].set_title(moment.title)
+                    grid[row][column].set_title(f"{moment.title}\n{grid[row][column].get_title()}")
             grid[row][0].set_ylabel(f"{kind}\nlayer")
         for axes in grid[-1]:
             axes.set_xlabel("heads, then MLP")
 
     note = (
-        "After an input is changed, the clean output of one head or MLP is put back. Darkest: the whole drop "
-        "of the answer's score comes back; empty: none of it, or there was no drop."
+        "Above each panel: how much its change takes away. Then the clean output of one head or MLP is put "
+        "back. Colour: how much comes back with it, that times the share of the answer's score that does, in "
+        f"the scale of the images above. {left_out}"
     )
-    size = (1.2 + PANEL_INCHES * len(moments), 0.5 + 1.4 * len(kinds))
-    return Chart(title, draw(title, size, paint), [], note)
+    size = (1.2 + PANEL_INCHES * len(moments), 0.5 + 1.55 * len(kinds))
+    return Chart(title, draw(title, size, paint), [], note.strip())
+
+
+def _matters(moment: ExplainedMoment, kind: str) -> bool:
+    """Return True if a head or MLP alone brings back more than counts as nothing."""
+    restored = _restored(moment, kind)
+    return restored is not None and float(brought_back(restored).max()) > _smallest(moment)
+
+
+def brought_back(restored: PatchingResult) -> np.ndarray:
+    """(L, heads + 1) effect of the change that comes back with each head, then with the layer's MLP."""
+    num_heads = max(len(heads) for heads in restored.heads)
+    ratios = np.zeros((len(restored.heads), num_heads + 1))
+    for layer, (heads, mlp) in enumerate(zip(restored.heads, restored.mlps, strict=True)):
+        ratios[layer, : len(heads)] = heads
+        ratios[layer, num_heads] = mlp
+    return abs(restored.measured) * np.clip(np.nan_to_num(ratios), 0, 1)
+
+
+def _smallest(moment: ExplainedMoment) -> float:
+    """Return the effect that counts as none."""
+    found = moment.explanation
+    return SMALLEST_MM if found.moved_mm is not None else smallest_drop(found.clean_score)
 
 
 def _restored(moment: ExplainedMoment, kind: str) -> PatchingResult | None:
@@ -124,20 +160,23 @@ def _kind(corruption: str) -> str:
     return KINDS[1] if re.match(rf"{WORDS}\b", corruption) else KINDS[0]
 
 
-def _paint_heads(axes: "Axes", restored: PatchingResult | None) -> None:
+def _paint_heads(axes: "Axes", moment: ExplainedMoment, kind: str, largest: float) -> None:
     axes.set_xticks([])
+    restored = _restored(moment, kind)
     if restored is None:
         axes.set_axis_off()
         return
-    num_heads = max(len(heads) for heads in restored.heads)
-    ratios = np.zeros((len(restored.heads), num_heads + 1))
-    for layer, (heads, mlp) in enumerate(zip(restored.heads, restored.mlps, strict=True)):
-        ratios[layer, : len(heads)] = heads
-        ratios[layer, num_heads] = mlp
-    shades = np.zeros((*ratios.shape, 4))
+    effects = brought_back(restored)
+    shades = np.zeros((*effects.shape, 4))
     shades[..., :3] = np.array(TINT_RGB) / 255
-    shades[..., 3] = np.clip(np.nan_to_num(ratios), 0, 1)
+    shades[..., 3] = [[strength(effect, largest) for effect in row] for row in effects.tolist()]
     axes.imshow(shades, aspect="auto", interpolation="nearest")
-    axes.axvline(num_heads - 0.5, color=INK, linewidth=0.6)
-    layers = sorted({0, len(ratios) - 1})
+    axes.axvline(effects.shape[1] - 1.5, color=INK, linewidth=0.6)
+    axes.set_title(amount(abs(restored.measured), moment.explanation.measured_unit))
+    layers = sorted({0, len(effects) - 1})
     axes.set_yticks(layers, [str(layer) for layer in layers])
+
+
+def amount(effect: float, unit: str) -> str:
+    """Return "14.3 mm" or "0.15 nats"."""
+    return f"{effect:{'.1f' if unit == 'mm' else '.2g'}} {unit}"

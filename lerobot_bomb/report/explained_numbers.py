@@ -7,7 +7,9 @@ import numpy as np
 
 from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.following import Following
-from lerobot_bomb.explain.moment import Explanation, PatchingResult, camera_name
+from lerobot_bomb.explain.moment import Explanation
+from lerobot_bomb.explain.moment_query import camera_name
+from lerobot_bomb.explain.patching import PatchingResult
 from lerobot_bomb.report.explained_pointing import pointing_tables
 from lerobot_bomb.report.table import Cell, Table
 
@@ -19,14 +21,14 @@ FOLLOWING_NOTE = (
 )
 
 
-def numbers_tables(moment: ExplainedMoment) -> list[Table]:
-    """Return the tables of one moment: effects of objects and words, what is restored."""
+def numbers_tables(moment: ExplainedMoment, largest: float) -> list[Table]:
+    """Return the tables of one moment; effects are shaded up to `largest`."""
     explanation = moment.explanation
     findings = [[Cell(each.question), Cell(each.answer)] for each in moment.findings]
     tables = [Table("What the score of the answer depends on", QUESTIONS, findings)]
     tables += [] if moment.pointing is None else [*pointing_tables(moment.pointing)]
-    tables += _objects(explanation)
-    tables += _words(explanation)
+    tables += _objects(explanation, largest)
+    tables += _words(explanation, largest)
     if moment.followings:
         tables.append(_followings(moment.followings))
     for restored in explanation.restored:
@@ -42,7 +44,7 @@ def effects_note(explanation: Explanation) -> str:
     )
 
 
-def _objects(explanation: Explanation) -> list[Table]:
+def _objects(explanation: Explanation, largest: float) -> list[Table]:
     note, moved = effects_note(explanation), explanation.moved_mm
     return [
         _effects(
@@ -51,12 +53,13 @@ def _objects(explanation: Explanation) -> list[Table]:
             effects,
             {} if moved is None else moved.objects[key],
             note,
+            largest,
         )
         for key, effects in explanation.objects.items()
     ]
 
 
-def _words(explanation: Explanation) -> list[Table]:
+def _words(explanation: Explanation, largest: float) -> list[Table]:
     note, moved = effects_note(explanation), explanation.moved_mm
     of_words = (
         f"{note} In quotes: single words, (2) where one stands for the second time; else what is named."
@@ -64,21 +67,27 @@ def _words(explanation: Explanation) -> list[Table]:
     tables = []
     if explanation.words:
         mm = {} if moved is None else moved.words
-        tables.append(_effects("Words left out of the attention", "words", explanation.words, mm, of_words))
+        tables.append(
+            _effects("Words left out of the attention", "words", explanation.words, mm, of_words, largest)
+        )
     if explanation.others:
         mm = {} if moved is None else moved.others
-        tables.append(_effects("Words changed", "what is changed", explanation.others, mm, note))
+        tables.append(_effects("Words changed", "what is changed", explanation.others, mm, note, largest))
     return tables
 
 
 def _effects(
-    title: str, column: str, drops: Mapping[str, float], moved_mm: Mapping[str, float], note: str
+    title: str,
+    column: str,
+    drops: Mapping[str, float],
+    moved_mm: Mapping[str, float],
+    note: str,
+    largest: float,
 ) -> Table:
     shown = moved_mm or drops
-    largest = max(map(abs, shown.values()), default=0.0) or 1.0
     rows = []
     for name in sorted(drops, key=lambda name: -shown[name]):
-        shade = max(0.0, shown[name]) / largest
+        shade = min(max(0.0, shown[name]) / (largest or 1.0), 1.0)
         drop = Cell(f"{drops[name]:.4f}", drops[name], None if moved_mm else shade)
         moved = [Cell(f"{moved_mm[name]:.1f}", moved_mm[name], shade)] if moved_mm else []
         rows.append([Cell(name), *moved, drop])
@@ -102,7 +111,9 @@ def _followings(followings: Mapping[str, Following]) -> Table:
 
 def _restored(restored: PatchingResult) -> list[Table]:
     title = f"Restored after: {restored.corruption}"
-    note = f"The score drops by {restored.drop:.4g}. 1: all of that comes back, 0: none; -: it did not drop."
+    far = "" if restored.moved_mm is None else f"The next action moves {restored.moved_mm:.1f} mm. "
+    drop = f"The score drops by {restored.drop:.4g}."
+    note = f"{far}{drop} 1: all of that comes back, 0: none; -: it did not drop."
     num_layers = len(restored.mlps)
     layers = [f"layer {layer}" for layer in range(num_layers)]
     tables = []
@@ -114,7 +125,7 @@ def _restored(restored: PatchingResult) -> list[Table]:
         [Cell(name), *map(_ratio, heads), _ratio(mlp)]
         for name, heads, mlp in zip(layers, restored.heads, restored.mlps, strict=True)
     ]
-    header = ["", *(f"head {head}" for head in range(num_heads)), "MLP"]
+    header = ["layer", *(f"head {head}" for head in range(num_heads)), "MLP"]
     return [*tables, Table(f"{title}; heads and MLPs", header, rows, note)]
 
 

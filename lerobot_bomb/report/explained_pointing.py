@@ -6,11 +6,11 @@ from html import escape
 import numpy as np
 
 from lerobot_bomb.bomb.move import place_name
-from lerobot_bomb.explain.aggregate import mean_of
+from lerobot_bomb.explain.aggregate import Mean, mean_of
 from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.film import CAMERA
 from lerobot_bomb.explain.maps import data_url
-from lerobot_bomb.explain.moment import camera_name
+from lerobot_bomb.explain.moment_query import camera_name
 from lerobot_bomb.explain.pointing import MARKED_PX, PointingCheck, marked
 from lerobot_bomb.report.cells import mean_cell
 from lerobot_bomb.report.table import Cell, Table
@@ -36,7 +36,7 @@ def pointing_tables(check: PointingCheck) -> Iterator[Table]:
         held = [Cell(f"{share:.2f}", share) for share in (pointed.held, meant.held)]
         rows.insert(2, [Cell("held"), *held, Cell("-")])
     note = f"It points at {check.finding.answer}. {NOTE}"
-    yield Table("What it points at", ["", "policy", "meant", "apart, mm"], rows, note)
+    yield Table("What it points at", ["what", "policy", "meant", "apart, mm"], rows, note)
     likeliest = pointed.likeliest[:NUM_PLACES]
     if likeliest:
         places = [
@@ -62,11 +62,9 @@ def pointing_figure(moment: ExplainedMoment) -> str:
     return f"<figure>{tag}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
-def mean_pointing(moments: Sequence[ExplainedMoment]) -> Iterator[Table]:
-    """Yield a table of how often pointing is right, its error, and how often the next action goes there."""
+def mean_shares(moments: Sequence[ExplainedMoment]) -> dict[str, Mean]:
+    """Return how often pointing is right, and how often the next action goes there; {}: it does not point."""
     checks = [each.pointing for each in moments if each.pointing is not None]
-    if not checks:
-        return
     shares = {
         "the place that is meant": [check.is_place_right for check in checks],
         "the stone that is meant": [check.is_stone_right for check in checks],
@@ -75,13 +73,22 @@ def mean_pointing(moments: Sequence[ExplainedMoment]) -> Iterator[Table]:
             check.goes_there for check in checks if check.is_place_right
         ],
     }
+    means = {name: mean_of([*map(float, values)]) for name, values in shares.items()}
+    return {name: mean for name, mean in means.items() if mean is not None}
+
+
+def mean_pointing(moments: Sequence[ExplainedMoment]) -> Iterator[Table]:
+    """Yield a table of how often pointing is right, its error, and how often the next action goes there."""
+    checks = [each.pointing for each in moments if each.pointing is not None]
+    if not checks:
+        return
     distances = {
         "from the place, mm": [check.place_mm for check in checks],
         "from the stone, mm": [check.stone_mm for check in checks],
     }
-    rows = [[Cell(name), mean_cell(mean_of([*map(float, values)]), ".2f")] for name, values in shares.items()]
+    rows = [[Cell(name), mean_cell(mean, ".2f")] for name, mean in mean_shares(moments).items()]
     rows += [[Cell(name), mean_cell(mean_of(values), ".1f")] for name, values in distances.items()]
-    yield Table("What it points at", ["", "share or mean"], rows, NOTE)
+    yield Table("What it points at", ["what", "share or mean"], rows, NOTE)
 
 
 def _millimetres(value: float) -> Cell:

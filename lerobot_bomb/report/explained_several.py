@@ -2,26 +2,27 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lerobot_bomb.explain.aggregate import Mean, mean_of, means_of
-from lerobot_bomb.explain.effects import OBJECTS, WORDS, Effect, Values, effects_in_phase
 from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.limits import ALL
 from lerobot_bomb.explain.probes import LayerProbe
 from lerobot_bomb.report.cells import mean_cell
-from lerobot_bomb.report.chart import COLORS, Chart, draw, tidy
+from lerobot_bomb.report.explained_means import (
+    MIDDLE,
+    effects_chart,
+    following_charts,
+    largest_mean,
+    mean_maps_html,
+    pointing_charts,
+    probes_chart,
+)
 from lerobot_bomb.report.explained_numbers import FOLLOWING_COLUMNS, FOLLOWING_NOTE
 from lerobot_bomb.report.explained_pointing import mean_pointing
 from lerobot_bomb.report.explanation import verdict_section
 from lerobot_bomb.report.table import Cell, Section, Table
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-MIDDLE = "The middle of the episode"
 
 
 def aggregate_sections(
@@ -29,51 +30,19 @@ def aggregate_sections(
 ) -> list[Section]:
     """Write the sections of several episodes: the verdict, then the numbers of each phase."""
     values = {phase: [each.as_json() for each in moments] for phase, moments in by_phase.items()}
-    sections = [verdict_section(sentences, ""), Section("Effects", [], charts=[effects_chart(values)])]
+    largest = largest_mean(by_phase)
+    charts = [effects_chart(values), *following_charts(by_phase), *pointing_charts(by_phase)]
+    sections = [
+        verdict_section(sentences, ""),
+        Section("Effects", [], charts=charts),
+        Section("Where in the image", [], [], mean_maps_html(by_phase, largest)),
+    ]
     tables = [
         replace(table, title=f"{phase.capitalize() or MIDDLE}, {len(moments)} episodes: {table.title}")
         for phase, moments in by_phase.items()
         for table in _mean_tables(moments)
     ]
     return [*sections, Section("All numbers", tables, [command], is_folded=True)]
-
-
-def effects_chart(by_phase: Mapping[str, Sequence[Values]]) -> Chart:
-    """Draw mean effects of objects and words with their intervals, phases side by side."""
-    effects = {
-        phase: [each for kind in (OBJECTS, WORDS) for each in effects_in_phase(moments, phase, kind)]
-        for phase, moments in by_phase.items()
-    }
-    names = [*dict.fromkeys(_label(each) for of_phase in effects.values() for each in of_phase)]
-    unit = next(each.unit for of_phase in effects.values() for each in of_phase) if names else ""
-    title = f"What changes when it is hidden, {unit}"
-
-    def paint(figure: "Figure") -> None:
-        grid = figure.subplots(1, len(effects), sharex=True, sharey=True, squeeze=False)
-        for axes, (phase, of_phase) in zip(grid[0], effects.items(), strict=True):
-            axes.set_title(phase or MIDDLE)
-            axes.set_yticks(range(len(names)), names)
-            axes.set_xlabel(unit)
-            for each in of_phase:
-                y = names.index(_label(each))
-                low, high = each.mean.interval or (each.mean.value, each.mean.value)
-                axes.plot([low, high], [y, y], color=COLORS[0], linewidth=1.5)
-                axes.plot(each.mean.value, y, "o", color=COLORS[0], markersize=5)
-            tidy(axes)
-        grid[0][0].invert_yaxis()
-
-    rows = [
-        [Cell(phase or MIDDLE), Cell(_label(each)), mean_cell(each.mean, ".3g")]
-        for phase, of_phase in effects.items()
-        for each in of_phase
-    ]
-    size = (2.2 + 1.9 * len(effects), 0.8 + 0.25 * len(names))
-    note = "Means over episodes with 95 % bootstrap intervals."
-    return Chart(title, draw(title, size, paint), [Table("", ["phase", "hidden", unit], rows)], note)
-
-
-def _label(effect: Effect) -> str:
-    return f"words: {effect.name}" if effect.kind == WORDS else effect.name
 
 
 def _mean_tables(moments: Sequence[ExplainedMoment]) -> Iterator[Table]:
@@ -109,13 +78,9 @@ def probes_section(probes: Sequence[LayerProbe]) -> Section:
         ]
         for each in probes
     ]
-    note = (
-        "Linear probes of each layer's states, means over tokens, in the first moment that is asked about. "
-        "Row and column: share of held-out episodes that are right; stone: share of variance explained; "
-        "floor: the same with shuffled labels."
-    )
     header = ["what", "states", "held out", "floor", "episodes held out"]
-    return Section("Where is the destination known?", [Table("Probes", header, rows, note)])
+    chart = probes_chart(probes, Table("", header, rows))
+    return Section("Where is the destination known?", [], charts=[chart])
 
 
 def _means(title: str, column: str, means: Mapping[str, Mean], form: str, note: str) -> Table:

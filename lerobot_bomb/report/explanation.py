@@ -5,9 +5,11 @@ from html import escape
 
 from lerobot_bomb.explain.counterfactuals import Counterfactual, settled_by
 from lerobot_bomb.explain.episode import ExplainedMoment
+from lerobot_bomb.explain.facts import turning
 from lerobot_bomb.explain.film import EpisodeRun
+from lerobot_bomb.explain.mask_names import change
 from lerobot_bomb.report.explained_film import counterfactual_html, paths_chart
-from lerobot_bomb.report.explained_maps import heads_chart, maps_html
+from lerobot_bomb.report.explained_maps import heads_section, largest_effect, maps_html
 from lerobot_bomb.report.explained_numbers import numbers_tables
 from lerobot_bomb.report.explained_pointing import pointing_figure
 from lerobot_bomb.report.table import Cell, Section, Table
@@ -38,15 +40,16 @@ def episode_sections(
     snapshot = moments[0].snapshot
     state = snapshot.state
     target_xy = None if state is None else state.goals[0].xyz[:2].tolist()
-    heads = heads_chart(moments)
+    heads = heads_section(moments)
     sections = [
         verdict_section(sentences, snapshot.instruction),
-        _happened(run, counterfactuals, target_xy),
+        _happened(run, masked, counterfactuals, target_xy),
         Section("What the next action depends on", [], [], maps_html(moments) + _pointing(moments)),
-        *([] if heads is None else [Section("Layers and heads", [], charts=[heads])]),
+        *([] if heads is None else [heads]),
         *([_masked(masked, target_xy)] if masked else []),
     ]
-    tables = [table for each in moments for table in numbers_tables(each)]
+    largest = largest_effect(moments)
+    tables = [table for each in moments for table in numbers_tables(each, largest)]
     lines = [*_not_asked(moments[0]), command]
     return [*sections, Section("All numbers", tables, lines, is_folded=True)]
 
@@ -61,13 +64,17 @@ def _pointing(moments: Sequence[ExplainedMoment]) -> str:
 
 
 def _happened(
-    run: EpisodeRun, counterfactuals: Sequence[Counterfactual], target_xy: Sequence[float] | None
+    run: EpisodeRun,
+    masked: Mapping[str, EpisodeRun],
+    counterfactuals: Sequence[Counterfactual],
+    target_xy: Sequence[float] | None,
 ) -> Section:
-    """Write filmstrips and paths of the episode and of the counterfactual that settles it."""
+    """Write filmstrips and paths of the episode and of the runs that settle it."""
     settled = settled_by(counterfactuals)
     charts = []
     if len(run.gripper_xyz):
         runs = {"this episode": run} | ({} if settled is None else {settled.name: settled.run})
+        runs |= _turned(run, masked)
         charts = [paths_chart("Paths over the board", runs, target_xy)]
     tables = []
     if counterfactuals:
@@ -75,6 +82,13 @@ def _happened(
         rows = [[Cell(name), *_outcome(each)] for name, each in runs.items()]
         tables = [Table("The same seed under fewer perturbations", ["episode", *OUTCOME], rows)]
     return Section("What happened", tables, [], counterfactual_html(run, settled), charts=charts)
+
+
+def _turned(run: EpisodeRun, masked: Mapping[str, EpisodeRun]) -> dict[str, EpisodeRun]:
+    """Return the first run under a mask that the verdict names: one that succeeds, or ends at the target."""
+    outcomes = {name: each.result.as_json() for name, each in masked.items()}
+    succeeded, right = turning(run.result.as_json(), outcomes)
+    return {change(name): masked[name] for name in [*succeeded, *right][:1]}
 
 
 def _outcome(run: EpisodeRun) -> list[Cell]:
@@ -93,16 +107,18 @@ def _outcome(run: EpisodeRun) -> list[Cell]:
 
 
 def _masked(masked: Mapping[str, EpisodeRun], target_xy: Sequence[float] | None) -> Section:
-    """Write what becomes of the episode if something is hidden in every step."""
-    rows = [[Cell(name), *_outcome(run)] for name, run in masked.items()]
-    note = "The same episode, with the same random numbers, each with something hidden in every step."
-    table = Table("What became of the stone", ["hidden from the policy", *OUTCOME], rows, note)
-    chart = paths_chart(
-        "Paths under masks", {f"{name} hidden": run for name, run in masked.items()}, target_xy
+    """Write what becomes of the episode if something is hidden or reworded in every step."""
+    named = {change(name): run for name, run in masked.items()}
+    rows = [[Cell(name), *_outcome(run)] for name, run in named.items()]
+    note = (
+        "The same episode, with the same random numbers, each with something hidden, or another word named, "
+        "in every step. The board's left half holds column 0, its far half row 0."
     )
+    table = Table("What became of the stone", ["given to the policy", *OUTCOME], rows, note)
+    chart = paths_chart("Paths under masks", named, target_xy)
     figure = f'<figure><div class="wide" tabindex="0">{chart.svg}</div></figure>'
     drawn = f"<details><summary>{escape(chart.title)}</summary>{figure}</details>"
-    return Section("With something hidden in every step", [table], [], drawn, is_folded=True)
+    return Section("With something hidden or reworded", [table], [], drawn, is_folded=True)
 
 
 def _not_asked(moment: ExplainedMoment) -> list[str]:

@@ -18,6 +18,7 @@ MAX_HOVER = 6000  # characters shown under the pointer
 MAX_ROWS = 200  # of a table that the page shows; the files beside it have all
 STYLE = """
 :root{color-scheme:light dark}
+body{background:Canvas;color:CanvasText}
 body{font:15px/1.5 system-ui,sans-serif;max-width:75rem;margin:0 auto;padding:1rem}
 h1{font-size:1.5rem}h2{font-size:1.2rem;margin-top:2.5rem;border-bottom:1px solid #8888}h3{font-size:1rem}
 .wide{overflow-x:auto}

@@ -10,8 +10,8 @@ from urllib.parse import quote
 
 from lerobot_bomb.report.report import Sample
 from lerobot_bomb.results.record import Record, different_fields
-from lerobot_bomb.viewing.episode import write_episode_with_film
-from lerobot_bomb.viewing.film import as_jpeg, film_of
+from lerobot_bomb.viewing.episode import write_episodes
+from lerobot_bomb.viewing.film import as_jpeg, run_filmed
 from lerobot_bomb.viewing.replay import Replay
 
 
@@ -38,10 +38,10 @@ def _run(sample: Sample, folder: Path, has_video: bool) -> Sample:
     try:
         run = Replay(record).viewed_run()
         if path is None:
-            film, result = film_of(run)
+            result, film = run_filmed(run)
         else:
             recording = path.with_suffix(".rrd")
-            result, film = write_episode_with_film(run, path.stem, recording, path)
+            ((result, film),) = write_episodes({"": run}, path.stem, recording, path, with_films=True)
             recording.unlink()
     except Exception as error:  # whatever it is: the page says it in the pictures' place
         lines = str(error).strip().splitlines() or [type(error).__name__]
@@ -49,7 +49,7 @@ def _run(sample: Sample, folder: Path, has_video: bool) -> Sample:
     different = different_fields(record, result)
     note = f"not as recorded: {different[0]} differs" if different else ""
     video = None if path is None else quote(f"{folder.name}/{path.name}")
-    return replace(sample, video=video, film=as_jpeg(film), note=note)
+    return replace(sample, video=video, film=None if film is None else as_jpeg(film), note=note)
 
 
 def _file_name(record: Record) -> str:

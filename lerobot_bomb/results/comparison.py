@@ -35,7 +35,7 @@ class Comparisons:
         number, num_better = len(self.conditions), sum(signs)
         parts = [f"B is better under {num_better}"] if num_better else []
         parts += [f"A is better under {len(signs) - num_better}"] if num_better < len(signs) else []
-        parts += [f"no difference is shown under {number - len(signs)}"] if len(signs) < number else []
+        parts += [f"no significant difference under {number - len(signs)}"] if len(signs) < number else []
         lines = [f"{each.condition}: {describe_verdict(each)}" for each in self.conditions]
         return [f"of {number} conditions: {', '.join(parts)}", *(f"  {line}" for line in lines)]
 
@@ -58,7 +58,7 @@ class Comparisons:
 
 
 def describe_verdict(compared: PairedComparison, first: str = "A", second: str = "B") -> str:
-    """Return 'B is better by 28 points [12, 43] (40 pairs, p = 0.0068)', or that no difference is shown."""
+    """Return 'B is better by 28 points [12, 43] (40 pairs, p = 0.0068)', or that this is not significant."""
     counts = compared.counts
     pairs = f"{counts.n} pair{'s' * (counts.n != 1)}"
     if counts.difference == 0:
@@ -69,8 +69,8 @@ def describe_verdict(compared: PairedComparison, first: str = "A", second: str =
     test = f"{pairs}, {format_p(compared.p_value)}"
     if compared.is_shown:
         return f"{better} is better by {points} ({test})"
-    needed = f"; about {compared.num_needed:,} pairs would show this much" if compared.num_needed else ""
-    return f"no difference is shown: {better} has {points} more ({test}{needed})"
+    needed = f"; about {compared.num_needed:,} pairs would be enough" if compared.num_needed else ""
+    return f"not significant: {better} leads by {points} ({test}{needed})"
 
 
 def _num_pairs(compared: PairedComparison) -> str:

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from lerobot_bomb.results.origin import PolicyIdentity
 
 UNKNOWN = "policy not recorded"
-SHIPPED = re.compile(r"(?:^|/)lerobot_bomb/checkpoints/weights/([^/]+)/?$")  # the folder of `bomb:NAME`
+SHIPPED_PREFIX = "bomb:"  # of the names of checkpoints that come with the package
+SHIPPED_FOLDER = re.compile(r"(?:^|/)lerobot_bomb/checkpoints/weights/([^/]+)/?$")
 SHOWN_DIGITS = 6  # of a SHA-256, where names are the same otherwise
 
 
@@ -40,8 +41,13 @@ def numbered(names: Sequence[str]) -> list[str]:
 def _base(policy: PolicyIdentity | None) -> str:
     if policy is None:
         return UNKNOWN
-    shipped = SHIPPED.search(policy.path or "")
-    return f"bomb:{shipped[1]}" if shipped else policy.type
+    return shipped_name(policy.path or "") or policy.type
+
+
+def shipped_name(path: str) -> str | None:
+    """Return `bomb:NAME` for the folder of a shipped checkpoint, on any machine; None for any other path."""
+    found = SHIPPED_FOLDER.search(path)
+    return f"{SHIPPED_PREFIX}{found[1]}" if found else None
 
 
 def _extended(

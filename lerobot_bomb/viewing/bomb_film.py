@@ -10,7 +10,11 @@ from lerobot_bomb.bomb.observation import CAMERAS, PIXELS
 from lerobot_bomb.envs.rollout import Moment
 from lerobot_bomb.viewing.film import Marks, Shot
 
-CONTACTS = {Stage.REACHED: "contact"} | dict.fromkeys((Stage.GRASPED, Stage.LIFTED, Stage.PLACED), "grasp")
+CONTACTS = {
+    Stage.REACHED: "contact",
+    Stage.GRASPED: "gripper closes",
+    **dict.fromkeys((Stage.LIFTED, Stage.PLACED), "grasp"),  # a stone that is lifted has been grasped
+}
 BESIDE_M = 0.6 * BOARD.pitch_m  # from the board's first line to its number
 RING_RADIUS_M = 1.25 * BOARD.stone_radius_m
 NUM_RING_POINTS = 24
@@ -42,5 +46,5 @@ def bomb_shot(env: gymnasium.Env, moment: Moment) -> Shot:
 
 
 def bomb_contact(moment: Moment) -> str:
-    """Return what the gripper has first done, 'contact' or 'grasp'; '' if nothing yet."""
+    """Return what the gripper has done so far: 'contact', 'gripper closes' or 'grasp'; '' if nothing yet."""
     return CONTACTS.get(Stage(moment.info["stage"]), "")

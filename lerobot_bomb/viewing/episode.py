@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -12,15 +12,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 import gymnasium
 import numpy as np
 
-from lerobot_bomb.environments import env_type
-from lerobot_bomb.envs.rollout import Agent, Moment, run_episode
+from lerobot_bomb.envs.rollout import Agent, Moment
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.results.record import Record, Spec
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
-    from lerobot_bomb.viewing.film import Shot
+    from lerobot_bomb.viewing.film import Shot, Watch
     from lerobot_bomb.viewing.rerun_file import EpisodeLog
 
 EXPERT, RANDOM = "expert", "random"
@@ -91,34 +90,21 @@ class ViewedRun:
     make_agent: Callable[[gymnasium.Env], AbstractContextManager[Agent]]
 
 
-def write_episodes(runs: Mapping[str, ViewedRun], name: str, rrd: Path, mp4: Path) -> list[Record]:
-    """Run the episodes one after the other, write recording and video, and return each result.
+def write_episodes(
+    runs: Mapping[str, ViewedRun], name: str, rrd: Path, mp4: Path, *, with_films: bool = False
+) -> list[tuple[Record, np.ndarray | None]]:
+    """Run the episodes one after the other, write recording and video, and return results and filmstrips.
 
     The entities of a single run are at the recording's top; those of several are below their names. The video
     shows several side by side, each below its name, condition and seed, and repeats the last image of an
     episode until the others have ended.
     """
-    results, _ = _write_episodes(runs, name, rrd, mp4, with_films=False)
-    return results
-
-
-def write_episode_with_film(run: ViewedRun, name: str, rrd: Path, mp4: Path) -> tuple[Record, np.ndarray]:
-    """Write one episode as `write_episodes` does; return its result and its filmstrip, (H, W, 3) uint8."""
-    (result,), (film,) = _write_episodes({"": run}, name, rrd, mp4, with_films=True)
-    return result, film
-
-
-def _write_episodes(
-    runs: Mapping[str, ViewedRun], name: str, rrd: Path, mp4: Path, with_films: bool
-) -> tuple[list[Record], list[np.ndarray]]:
-    from lerobot_bomb.viewing.film import Film, draw_film
+    from lerobot_bomb.viewing.film import run_filmed
     from lerobot_bomb.viewing.rerun_file import open_recording
-    from lerobot_bomb.viewing.video import packed
 
     prefixes = {label: f"{label}/" if len(runs) > 1 else "" for label in runs}
     fps = next(iter(runs.values())).viewed.fps
-    results: list[Record] = []
-    films: list[np.ndarray] = []
+    found: list[tuple[Record, np.ndarray | None]] = []
     images: dict[str, list[np.ndarray]] = {}
     with (
         written_whole(rrd, mp4) as (unfinished_rrd, unfinished_mp4),
@@ -126,21 +112,22 @@ def _write_episodes(
     ):
         for label, run in runs.items():
             log = run.viewed.log(recording, prefixes[label], run.viewed.spec)
-            title = ", ".join(filter(None, (label, run.viewed.title)))
-            images[title] = []
-            with closing(run.viewed.make_env()) as env, run.make_agent(env) as agent:
-                film = Film(env_type(run.viewed.env_type).view, env) if with_films else None
-                for moment in run_episode(env, run.viewed.spec, agent):
-                    log.add(moment)
-                    images[title].append(packed(cast("np.ndarray", env.render())))
-                    if film is not None:
-                        film.add(moment)
-                results.append(env.get_wrapper_attr("episode_result")())
-            log.add_result(results[-1])
-            if film is not None:
-                films.append(draw_film(film, run.viewed, results[-1]))
+            shown = images[", ".join(filter(None, (label, run.viewed.title)))] = []
+            found.append(run_filmed(run, _logging(log, shown), with_films))
+            log.add_result(found[-1][0])
         _write_video(images, fps, unfinished_mp4)
-    return results, films
+    return found
+
+
+def _logging(log: "EpisodeLog", images: list[np.ndarray]) -> "Watch":
+    """Return a watch that adds each moment to a log, and its image for people, packed, to a list."""
+    from lerobot_bomb.viewing.video import packed
+
+    def watch(env: gymnasium.Env, moment: Moment) -> None:
+        log.add(moment)
+        images.append(packed(cast("np.ndarray", env.render())))
+
+    return watch
 
 
 def _write_video(images: Mapping[str, list[np.ndarray]], fps: int, path: Path) -> None:

@@ -1,7 +1,7 @@
 """Filmstrip of an episode: its start, its first contact, and its end, on one image."""
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 
@@ -24,6 +24,8 @@ MAX_TITLE = 70  # characters
 MARK_RGB, EDGE_RGB = (255, 255, 255), (0, 0, 0)  # white with a black edge is seen on all that is drawn
 RING_RGB = (255, 0, 190)  # pink: neither board nor stones nor gripper have it, also for the colour-blind
 MARK_SIZE, RING_WIDTH = 14, 3  # pixels
+
+type Watch = Callable[[gymnasium.Env, Moment], None]
 
 
 @dataclass(frozen=True)
@@ -78,15 +80,23 @@ class Film:
         return np.vstack([sheet, caption(instruction, outcome, sheet.shape[1])])
 
 
-def film_of(run: ViewedRun) -> tuple[np.ndarray, Record]:
-    """Run an episode, and return its filmstrip, (H, W, 3) uint8, and its result."""
+def run_filmed(
+    run: ViewedRun, watch: Watch | None = None, with_film: bool = True
+) -> tuple[Record, np.ndarray | None]:
+    """Run an episode; return its result, and its filmstrip, (H, W, 3) uint8, if one is to be drawn.
+
+    ``watch`` gets each moment while the environment is in it.
+    """
     viewed = run.viewed
     with closing(viewed.make_env()) as env, run.make_agent(env) as agent:
-        film = Film(env_type(viewed.env_type).view, env)
+        film = Film(env_type(viewed.env_type).view, env) if with_film else None
         for moment in run_episode(env, viewed.spec, agent):
-            film.add(moment)
+            if watch is not None:
+                watch(env, moment)
+            if film is not None:
+                film.add(moment)
         result: Record = env.get_wrapper_attr("episode_result")()
-    return draw_film(film, viewed, result), result
+    return result, None if film is None else draw_film(film, viewed, result)
 
 
 def draw_film(film: Film, viewed: Viewed, result: Record) -> np.ndarray:

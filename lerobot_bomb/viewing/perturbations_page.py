@@ -1,4 +1,4 @@
-"""``docs/perturbations.md``, generated: the table of the code, its sheets, and example instructions."""
+"""``docs/perturbations.md``, generated: every axis with its sheet, and example instructions."""
 
 import os
 from pathlib import Path
@@ -38,9 +38,7 @@ lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/galle
 Each condition is a group in `eval_info.json`, such as `place.camera-2.light-3` or `place.all-1to5`.
 Everything needed stays in view, and the instruction stays unambiguous.
 
-`lerobot-bomb view gallery --output=docs/media/perturbations --doc=docs/perturbations.md` writes this page.
-The magnitudes are in `lerobot_bomb/bomb/perturbations.py`, the axes' code in
-`envs/lerobot_env_bomb/axes/AXIS.py`.
+Each picture names the magnitudes of its levels; [all of them as tables](reference/axes.md).
 """
 
 
@@ -56,7 +54,7 @@ def page(instructions: list[str], sheets: str) -> str:
     sections = [axis_section(name, axis, sheets) for name, axis in AXES.items()]
     position = list(AXES).index("language")
     sections[position] += _forms(instructions)
-    everything = f"## {ALL}\n\nAll axes but `goal_marker` at the same level.\n\n{_image(ALL, sheets)}"
+    everything = f"## {ALL}\n\n{_image(ALL, sheets)}"
     return "\n".join([INTRODUCTION, *sections, everything])
 
 
@@ -73,19 +71,9 @@ def example_instructions() -> list[str]:
 
 
 def axis_section(name: str, axis: Axis, sheets: str) -> str:
-    """Write an axis' heading, its magnitudes as a table, and a link to its sheet."""
-    lines = [
-        f"## {name}",
-        "",
-        f"{axis.summary[0].upper()}{axis.summary[1:]}. Changes: {', '.join(axis.changes)}.",
-        "",
-        f"| | {' | '.join(map(str, LEVELS))} | unit | |",
-        f"|---|{'---|' * MAX_LEVEL}---|---|",
-    ]
-    for quantity, size in axis.magnitudes.items():
-        values = " | ".join(f"{value:g}" for value in size.levels)
-        lines.append(f"| {quantity} | {values} | {size.unit} | {size.what} |")
-    return "\n".join([*lines, "", _image(name, sheets)])
+    """Write an axis' heading, what it changes, and a link to its sheet, which names the magnitudes."""
+    changes = f"Changes: {', '.join(axis.changes)}."
+    return f"## {name}\n\n{axis.summary[0].upper()}{axis.summary[1:]}. {changes}\n\n{_image(name, sheets)}"
 
 
 def _image(name: str, sheets: str) -> str:

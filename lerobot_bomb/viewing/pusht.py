@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import numpy as np
 
+from lerobot_bomb.envs.rollout import Moment
 from lerobot_bomb.pusht.episode import (
+    BOARD_PX,
     FPS,
     IMAGE_SIZE,
     INSTRUCTIONS,
@@ -20,7 +22,11 @@ from lerobot_bomb.results.pusht import PushTResult
 from lerobot_bomb.viewing.episode import RANDOM, EnvView, Viewed
 from lerobot_bomb.viewing.sheet import text_tile
 
+if TYPE_CHECKING:
+    from lerobot_bomb.viewing.film import Shot
+
 ENV_ID = "lerobot_env_bomb_pusht:bomb_pusht/PushT-v0"
+COVERAGE_AT = 0.95  # of the image's height, where the coverage stands
 PUSHED_STEPS = 6  # through the block, to show what `dynamics` does
 
 
@@ -39,6 +45,18 @@ class PushTView(EnvView):
 
     def of_record(self, record: PushTResult, spec: PushTSpec, depth: bool) -> Viewed:
         return _episode(spec, record.image_size)
+
+    def shot(self, env: gymnasium.Env, moment: Moment) -> "Shot":
+        """Return the image for people, with the target's outline and how much of it is covered."""
+        from lerobot_bomb.viewing.film import Marks, Shot
+
+        image = np.asarray(env.render())
+        side = image.shape[0]
+        corners = env.get_wrapper_attr("target_outline")() * (side / BOARD_PX)
+        outline = [(float(x), float(y)) for x, y in corners]
+        coverage = moment.info.get("coverage")  # gym-pusht measures it after a step
+        words = {} if coverage is None else {f"covered: {coverage:.0%}": (side / 2, COVERAGE_AT * side)}
+        return Shot({"camera": image}, {"camera": Marks(words, [outline])})
 
 
 def _episode(spec: PushTSpec, image_size: int) -> Viewed:

@@ -13,8 +13,8 @@ from lerobot_bomb.checkpoints.config import config_damage
 from lerobot_bomb.checkpoints.environment import complete_evaluation
 from lerobot_bomb.checkpoints.names import is_hub_id
 from lerobot_bomb.checkpoints.processor_files import check_saved_processors
-from lerobot_bomb.checkpoints.shipped import PREFIX, checkpoint_path
-from lerobot_bomb.compat.hooks.datasets import explain_missing_datasets, read_asked_columns
+from lerobot_bomb.checkpoints.shipped import checkpoint_path
+from lerobot_bomb.compat.hooks.datasets import explain_missing_datasets, keep_frames_in_memory
 from lerobot_bomb.compat.hooks.errors import tell_config_errors, tell_refusals
 from lerobot_bomb.compat.hooks.evaluation import check_evaluations
 from lerobot_bomb.compat.hooks.flags import tell_wrong_flags
@@ -24,8 +24,10 @@ from lerobot_bomb.compat.hooks.policies import remember_policies
 from lerobot_bomb.compat.hooks.torchcodec import shorten_torchcodec_warning
 from lerobot_bomb.compat.use import register
 from lerobot_bomb.data.hub_token import check_token_characters
+from lerobot_bomb.data.kept_frames import keep_frames
 from lerobot_bomb.data.missing import describe_missing_dataset
 from lerobot_bomb.flag_errors import hint, refuse_unknown
+from lerobot_bomb.results.names import SHIPPED_PREFIX
 
 OURS = (
     lerobot_bomb,
@@ -40,7 +42,7 @@ OURS = (
 )
 SHARED = "lerobot_env_mujoco"  # our package with which environments draw; it has no type
 
-resolve_checkpoints(PREFIX, checkpoint_path)
+resolve_checkpoints(SHIPPED_PREFIX, checkpoint_path)
 register(
     [*(package.__name__ for package in OURS), SHARED],
     [
@@ -50,7 +52,7 @@ register(
         tell_refusals,
         lambda: tell_wrong_flags(hint, refuse_unknown),
         lambda: explain_missing_datasets(describe_missing_dataset),
-        read_asked_columns,
+        lambda: keep_frames_in_memory(keep_frames),
         lambda: check_evaluations(complete_evaluation),
         lambda: check_tokens_before_use(check_token_characters),
         publish_as_the_policy_says,

@@ -76,7 +76,7 @@ def test_one_commit_holds_all_that_is_needed_and_nothing_of_this_machine(
     assert len(repository.messages) == 1
     assert repository.is_private
     files = repository.files()
-    assert {Path(name).suffix for name in files} == {".json", ".safetensors", ".md", ".png"}
+    assert {Path(name).suffix for name in files} == {".json", ".safetensors", ".md", ".svg"}
     assert not any(b"/data/" in content or TOKEN.encode() in content for content in files.values())
     assert TOKEN not in "".join(capsys.readouterr())
     card = files["README.md"].decode()
@@ -102,7 +102,7 @@ def test_the_figure_of_an_older_push_goes_with_its_rates(
     results.write_text(result(1000, is_success=True))
     assert push(checkpoint, "--results", str(results)) == 0
     files = online.model(REPO_ID).files()
-    assert files[FIGURE].startswith(b"\x89PNG")
+    assert files[FIGURE].startswith(b"<svg ")
     assert f"]({FIGURE})" in files["README.md"].decode()
     assert push(checkpoint) == 0
     files = online.model(REPO_ID).files()

@@ -1,6 +1,8 @@
 """`lerobot-bomb push`: what is published and what is refused; tests/hub/test_loop.py trains on it."""
 
+import re
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -10,9 +12,11 @@ from hub.dataset_damage import DATASET_DAMAGES
 from hub.server import TOKEN, LoopbackHub
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.facts import DatasetFacts
-from lerobot_bomb.hub.dataset import dataset_card
+from lerobot_bomb.data.recording import Recording
+from lerobot_bomb.hub.dataset import FIGURE, dataset_card, figure
 
 REPO_ID = "me/d"
+RECORDING = asdict(Recording(REPO_ID, episodes=16))
 COUNTS = {"total_episodes": 3, "total_frames": 60, "fps": 10}
 
 
@@ -57,6 +61,7 @@ def test_one_commit_tagged_for_lerobot_with_a_card(
     card = files["README.md"].decode()
     assert foreseen.startswith(card)
     assert set(foreseen[len(card) :].split()) == files.keys() - {"README.md"}
+    assert files[FIGURE].startswith(b"<svg ") and f"]({FIGURE})" in card
     assert yaml.safe_load(card.split("---\n")[1])["task_categories"] == ["robotics"]
     for part in (
         "suite place",
@@ -72,6 +77,26 @@ def test_one_commit_tagged_for_lerobot_with_a_card(
     assert str(tmp_path) not in card
     assert push(root) == 0  # again: the tag moves on
     assert repository.refs["v3.0"] == repository.refs["main"]
+
+
+def test_the_card_tells_how_often_the_expert_succeeded() -> None:
+    failures = [{"seed": seed, "failure": "dropped" if seed > 1 else "imprecise"} for seed in range(5)]
+    facts = DatasetFacts(
+        {**COUNTS, "codebase_version": "v3.0", "features": {}},
+        {"num_episodes": 15, "failures": failures, "recording": RECORDING},
+    )
+    card = dataset_card(REPO_ID, facts)
+    assert "The scripted expert succeeded in 15/20 = 75.0 % [53.1, 88.8] of the episodes it ran" in card
+    drawn = figure(facts)
+    assert drawn is not None
+    # per cent of each class, in the bar
+    assert re.findall(r">(\d+)</text>", drawn.decode().split("per cent of episodes")[-1]) == [
+        "75",
+        "15",
+        "10",
+    ]
+    relabelled = replace(facts, bomb={**facts.bomb, "recording": {**RECORDING, "relabel": "0" * 64}})
+    assert figure(relabelled) is None and "successes" not in dataset_card(REPO_ID, relabelled)
 
 
 def test_the_card_of_converted_data_claims_no_licence_and_names_its_source() -> None:

@@ -1,17 +1,19 @@
 """Success rates on a card, in a sentence, in a figure and in the metadata."""
 
-import io
 import json
+import re
 from typing import Any
+from xml.etree import ElementTree
 
-import numpy as np
 import pytest
 from bomb_pusht_cases import pusht_row
-from PIL import Image
 from result_rows import read, values
 
 from lerobot_bomb.hub.evaluations import model_index
-from lerobot_bomb.hub.rates import MAX_ROWS, figure, headline, mostly_failing, rates_of
+from lerobot_bomb.hub.rates import headline, mostly_failing, rates_chart, rates_of
+from lerobot_bomb.report.chart import standalone
+from lerobot_bomb.report.report import Report
+from lerobot_bomb.report.sections import answer
 from lerobot_bomb.results.groups import Group, groups_of
 from lerobot_bomb.results.reading import parse_record
 
@@ -64,22 +66,28 @@ def test_conditions_that_mostly_fail() -> None:
     assert mostly_failing([group(none=(2, 4), camera_3=(1, 4))]) == ["`camera:3` (1/4)"]
 
 
-def test_the_figure_has_a_dot_where_the_rate_is() -> None:
-    pixels = np.asarray(
-        Image.open(io.BytesIO(figure([group(none=(10, 10), camera_3=(0, 10))]))).convert("RGB")
+def dots(svg: str) -> list[tuple[float, float]]:
+    """(x, y) of the marks of the first column, from the top down."""
+    first = svg[svg.index("success, per cent") : svg.index("change, percentage points")]
+    found = re.findall(
+        r'<use href="#\w+" x="([\d.]+)" y="([\d.]+)" style="fill: #0072b2; stroke: #0072b2"', first
     )
-    blue = np.argwhere((pixels == (0, 114, 178)).all(axis=2))
-    rows, columns = blue.T
-    upper, lower = (columns[mask] for mask in (rows < np.median(rows), rows > np.median(rows)))
-    assert upper.min() > lower.max()  # 10 of 10 at the right, above 0 of 10 at the left
+    return sorted(((float(x), float(y)) for x, y in found), key=lambda xy: xy[1])
 
 
-@pytest.mark.parametrize("number", [1, MAX_ROWS, MAX_ROWS + 5])
-def test_the_figure_grows_with_the_conditions_up_to_a_number(number: int) -> None:
-    names = [f"camera:{1 + i % 5}+light:{1 + i // 5 % 5}+start:{1 + i // 25}" for i in range(number)]
-    records = [read(values(0, spec={"perturbations": name})) for name in names]
-    image = Image.open(io.BytesIO(figure(groups_of(records))))
-    assert image.size[1] == pytest.approx(150 * (0.24 * (min(number, MAX_ROWS) + 3) + 0.3), abs=2)
+def test_the_figure_has_a_dot_where_each_rate_is() -> None:
+    svg = rates_chart([group(none=(10, 10), light_3=(5, 10), camera_3=(0, 10))]).svg
+    (all_of_them, _), (none, _), (half, _) = dots(svg)
+    assert none < half < all_of_them and half - none == pytest.approx(all_of_them - half, abs=0.1)
+    names = [svg.index(f">{name}<") for name in ("unperturbed", "camera:3", "light:3")]
+    assert names == sorted(names)
+
+
+def test_the_figure_of_a_card_is_that_of_a_report() -> None:
+    groups = [group(none=(9, 10), camera_3=(2, 10))]
+    (chart,) = answer.section(Report(groups)).charts
+    assert rates_chart(groups) == chart
+    assert ElementTree.fromstring(standalone(chart.svg)).tag == "{http://www.w3.org/2000/svg}svg"
 
 
 def test_the_metadata_has_a_name_without_numbers_and_the_counts_beside_it() -> None:

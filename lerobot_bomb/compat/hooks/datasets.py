@@ -1,4 +1,4 @@
-"""LeRobot's datasets: fewer images are decoded, and a missing dataset is an error of one line."""
+"""LeRobot's datasets: frames are read from memory, and a missing dataset is an error of one line."""
 
 from collections.abc import Callable
 from inspect import signature
@@ -12,30 +12,16 @@ from lerobot.datasets.utils import INFO_PATH
 from lerobot_bomb.compat.hooks.replace import replace
 
 
-def read_asked_columns() -> None:
-    """Let LeRobot read only the requested columns of a sample's other frames, not their images.
+def keep_frames_in_memory(keep: Callable[[Any], Any]) -> None:
+    """Put `keep(frames)` in the place of the Hugging Face dataset that LeRobot takes samples from."""
 
-    Otherwise a chunk of 16 actions decodes the images of all its 16 frames, and throws them away.
-    """
+    def around(usual: Callable[..., Any]) -> Callable[..., Any]:
+        def load(self: DatasetReader) -> Any:
+            return keep(usual(self))
 
-    def around(usual: Callable[..., dict[str, Any]]) -> Callable[..., dict[str, Any]]:
-        def query(self: Any, query_indices: dict[str, list[int]]) -> dict[str, Any]:
-            whole = self.hf_dataset
-            columns = vars(self).setdefault("_columns", {})
-            result: dict[str, Any] = {}
-            try:
-                for key, indices in query_indices.items():
-                    if key in whole.column_names and columns.get(key, (None,))[0] is not whole:
-                        columns[key] = whole, whole.select_columns(key)
-                    self.hf_dataset = columns[key][1] if key in columns else whole
-                    result |= usual(self, {key: indices})
-            finally:
-                self.hf_dataset = whole
-            return result
+        return load
 
-        return query
-
-    replace(DatasetReader, "_query_hf_dataset", around)
+    replace(DatasetReader, "_load_hf_dataset", around)
 
 
 def explain_missing_datasets(explain: Callable[[str, Path, Exception], str]) -> None:

@@ -32,7 +32,7 @@ def section(report: Report) -> Section:
         return Section(TITLE, [])
     title = "How episodes ended: share of each class of failure"
     bars = outcomes(report)
-    svg = _stacked(title, bars.header[2:], bars)
+    svg = stacked(title, bars.header[2:], bars)
     told = [_told(report.label(group), group) for group in report.groups if not _all_succeed(group)]
     chart = Chart(title, svg, [bars, *map(failures, report.groups)], "Each bar is 100 % of its episodes.")
     return Section(TITLE, [], statements=told[:MAX_TOLD], charts=[chart])
@@ -66,8 +66,8 @@ def outcomes(report: Report) -> Table:
     return Table("", ["policy, suite", "episodes", "success", *names], rows)
 
 
-def _stacked(title: str, classes: Sequence[str], bars: Table) -> str:
-    """Draw the bars of a table of outcomes."""
+def stacked(title: str, classes: Sequence[str], bars: Table) -> str:
+    """Draw the bars of a table of `outcomes`."""
     rows = bars.rows[:MAX_BARS]
 
     def paint(figure: "Figure") -> None:

@@ -14,8 +14,9 @@ NOTE = (
     "--policy.NAME=VALUE of the evaluation, if it had any. 'explain' shows what its actions depend on."
 )
 LEGEND = (
-    "Each filmstrip is an episode that was run again: its start, its first grasp (or contact, or middle), "
-    "its end. Pink rings are the targets; r0 to r4 and c0 to c4 number rows and columns."
+    "Each filmstrip is an episode that was run again: its start, its first grasp (or where the gripper "
+    "closed without one, or its middle), its end. Pink outlines are the targets; r0 to r4 and c0 to c4 "
+    "number rows and columns of BOMB's board; 'covered' is the share of PushT's target under the block."
 )
 MAX_NAME = 100  # characters of a group's name in a heading
 
