@@ -123,8 +123,9 @@ def run(args: argparse.Namespace) -> int:
     if isinstance(recording, Recording):
         _warn_of_test_seeds(recording)
     with terminated_in_order():
-        is_relabelled = isinstance(recording, Recording) and recording.relabel
-        behavior = _behavior_policy(recording, args.policy_path) if is_relabelled else None
+        behavior = None
+        if isinstance(recording, Recording) and recording.relabel:
+            behavior = _behavior_policy(recording, args.policy_path)
         if shard is not None:
             return _record_part(Part(recording, *shard), root, EpisodeSource(args.workers, behavior=behavior))
         if args.join:
