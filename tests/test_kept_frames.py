@@ -53,10 +53,14 @@ def read(root: Path, **options: Any) -> Any:
 @pytest.fixture
 def stock(root: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Return the dataset as LeRobot reads it without the plugin."""
-    usual = DatasetReader._load_hf_dataset
     with monkeypatch.context() as patch:
-        patch.setattr(DatasetReader, "_load_hf_dataset", getattr(usual, replace.ORIGINAL, usual))
+        patch.setattr(DatasetReader, "_load_hf_dataset", original(DatasetReader._load_hf_dataset))
         return read(root)
+
+
+def original(method: Any) -> Any:
+    """Return what a method was before a hook took its place."""
+    return getattr(method, replace.ORIGINAL, method)
 
 
 def require_equal(item: dict[str, Any], expected: dict[str, Any]) -> None:
@@ -80,6 +84,23 @@ def test_samples_equal_those_of_lerobot(
         for index in range(len(stock)):
             require_equal(ours[index], stock[index])
     assert bool(ours.hf_dataset._kept) == bool(memory_share)
+
+
+@pytest.mark.usefixtures("in_memory")
+@pytest.mark.parametrize("episodes", [None, [1]])
+def test_real_samples_equal_those_of_lerobot(
+    pusht_dataset: Path, episodes: list[int] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    times = {ACTION: [step / FPS for step in range(16)], "observation.image": [-1 / FPS, 0.0]}
+
+    def samples() -> list[Any]:
+        dataset = LeRobotDataset("a/b", pusht_dataset, episodes=episodes, delta_timestamps=times)
+        return [dataset[index] for index in (0, 7, len(dataset) - 1)]
+
+    ours = samples()
+    monkeypatch.setattr(DatasetReader, "_load_hf_dataset", original(DatasetReader._load_hf_dataset))
+    for mine, theirs in zip(ours, samples(), strict=True):
+        require_equal(mine, theirs)
 
 
 @pytest.mark.usefixtures("in_memory")

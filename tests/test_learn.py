@@ -150,7 +150,7 @@ def test_parts_of_a_task_are_recorded_and_merged(monkeypatch: pytest.MonkeyPatch
 
     def run(*command: str) -> None:
         ran.append(command)
-        roots = [flag.split("=")[1] for flag in command if flag.startswith(("--root=", "--new_root="))]
+        roots = [flag.split("=")[1] for flag in command if flag.startswith("--root=")]
         Path(roots[0]).mkdir()
 
     monkeypatch.setattr(learn, "run_command", run)
@@ -164,9 +164,8 @@ def test_parts_of_a_task_are_recorded_and_merged(monkeypatch: pytest.MonkeyPatch
         scenes
     )
     assert not any(flag.startswith(("--noise", "--episodes")) for flag in scenes)
-    roots = json.dumps([str(tmp_path / "shown_goal"), str(folder)])
-    assert merge[0] == "lerobot-edit-dataset" and f"--operation.roots={roots}" in merge
-    assert dataset.is_dir() and not (tmp_path / "merging").exists()
+    assert merge[1:5] == ("record", "merge", str(tmp_path / "shown_goal"), str(folder))
+    assert dataset.is_dir()
 
 
 def test_an_evaluation_of_several_suites_has_a_row_for_each() -> None:
