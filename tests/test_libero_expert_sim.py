@@ -16,6 +16,8 @@ from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.data.libero_conversion import libero_layout
 from lerobot_bomb.libero.assets import Libero
 
+pytestmark = pytest.mark.long
+
 SIZE = 32
 SEED = 5
 TASK_ID = 4  # the bowl is in a drawer
