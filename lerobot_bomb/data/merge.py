@@ -9,6 +9,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 
 from lerobot_bomb.data.blocks import DatasetLayout, merge_blocks
 from lerobot_bomb.data.columns import read_meta
+from lerobot_bomb.data.unfinished import unfinished_folder
 
 
 def merge_datasets(folders: Sequence[Path], repo_id: str, root: Path) -> tuple[int, int]:
@@ -32,7 +33,7 @@ def merge_datasets(folders: Sequence[Path], repo_id: str, root: Path) -> tuple[i
     arrays = [key for key, value in features.items() if len(value["shape"]) == 2]
     robot: Any = first.robot_type  # None in datasets of others
     layout = DatasetLayout(repo_id, first.fps, robot, features, bool(first.video_keys), tuple(arrays))
-    unfinished = root.with_name(f"{root.name}.merging")
+    unfinished = unfinished_folder(root, "merging")
     shutil.rmtree(unfinished, ignore_errors=True)
     merge_blocks(layout, list(folders), unfinished)
     unfinished.rename(root)

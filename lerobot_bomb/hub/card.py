@@ -21,7 +21,7 @@ from lerobot_bomb.hub.method import BOMB, Method
 from lerobot_bomb.hub.rates import FIGURE, headline, rates_chart, results_table
 from lerobot_bomb.hub.training import peft_flags, train_command
 from lerobot_bomb.hub.usage import how_to_use, in_python
-from lerobot_bomb.report.chart import standalone
+from lerobot_bomb.report.chart import Chart, standalone
 from lerobot_bomb.results.groups import Group, groups_of
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.vlm.tokenizer import NANO
@@ -71,7 +71,7 @@ class Checkpoint:
 
     def figure(self) -> bytes | None:
         """Return the SVG that the card shows; None if it has no rates."""
-        return standalone(rates_chart(self._groups).svg).encode() if self.results else None
+        return standalone(self._chart.svg).encode() if self.results else None
 
     @cached_property
     def history(self) -> History:
@@ -151,12 +151,16 @@ class Checkpoint:
         ]
         return "\n\n".join(paragraphs)
 
+    @cached_property
+    def _chart(self) -> Chart:
+        return rates_chart(self._groups)
+
     def _figure_text(self) -> list[str]:
         """Return the figure and its note, as Markdown; [] without rates."""
         if not self._groups:
             return []
         image = f"![Success by condition, as in the table below]({FIGURE})"
-        return [image, plain(rates_chart(self._groups).note)]
+        return [image, plain(self._chart.note)]
 
     def _size(self) -> str:
         if self.num_parameters is None:

@@ -63,7 +63,7 @@ class LiberoState:
 def libero_expert_action(state: LiberoState) -> np.ndarray:
     """(7,) float32 relative action that brings the gripper to its target, within [-1, 1]."""
     motion_m = state.target_xyz - state.gripper_xyz - PENDING * state.pending_m
-    turn_rad = _rotation_vector(state.target_mat @ state.gripper_mat.T) - PENDING * state.pending_rad
+    turn_rad = rotation_vector(state.target_mat @ state.gripper_mat.T) - PENDING * state.pending_rad
     motion = _limited(GAIN * motion_m / MAX_MOTION_M, state.speed)
     turn = _limited(GAIN * turn_rad / MAX_TURN_RAD, state.speed)
     return np.array([*motion, *turn, state.gripper], dtype=np.float32)
@@ -74,10 +74,14 @@ def _limited(vector: np.ndarray, most: float) -> np.ndarray:
     return vector * min(1.0, most / max(float(np.linalg.norm(vector)), 1e-9))
 
 
-def _rotation_vector(mat: np.ndarray) -> np.ndarray:
+def angle_of(mat: np.ndarray) -> float:
+    """Return the angle in radians of a (3, 3) rotation."""
+    return float(np.arccos(np.clip((np.trace(mat) - 1) / 2, -1, 1)))
+
+
+def rotation_vector(mat: np.ndarray) -> np.ndarray:
     """(3, 3) rotation -> (3,) axis times angle in radians."""
-    cosine = np.clip((np.trace(mat) - 1) / 2, -1, 1)
-    angle_rad = float(np.arccos(cosine))
+    angle_rad = angle_of(mat)
     if angle_rad < 1e-6:
         return np.zeros(3)
     if angle_rad > np.pi - 1e-3:  # the sine vanishes: the axis is a column of the symmetric part

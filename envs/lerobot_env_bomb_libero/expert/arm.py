@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_bomb.libero.expert import rotation_vector
 from lerobot_env_bomb_libero.expert.task import LiberoTask
 from lerobot_env_bomb_libero.scene import ROBOT_PREFIXES, LiberoScene
 from lerobot_env_bomb_libero.stock import mujoco
@@ -39,19 +40,6 @@ class Pose:
     def shifted(self, offset: np.ndarray) -> "Pose":
         """Return the pose moved by (3,) metres in the world."""
         return Pose(self.xyz + offset, self.mat)
-
-
-def angle_of(mat: np.ndarray) -> float:
-    """Angle in radians of a (3, 3) rotation."""
-    return float(np.arccos(np.clip((np.trace(mat) - 1) / 2, -1, 1)))
-
-
-def rotation_vector(mat: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation -> (3,) axis times angle in radians."""
-    quat, vector = np.empty(4), np.empty(3)
-    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(mat).ravel())
-    mujoco.mju_quat2Vel(vector, quat, 1.0)
-    return vector
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_env_bomb_libero.expert.arm import Pose, angle_of
+from lerobot_bomb.libero.expert import angle_of
+from lerobot_env_bomb_libero.expert.arm import Pose
 from lerobot_env_bomb_libero.expert.surfaces import Surface
 
 # the Panda's gripper, relative to the point between the pads
@@ -23,6 +24,7 @@ MAX_POINTS = 220
 MIN_CONTACTS = 3
 TOUCH_M = 0.004  # depth of what a pad touches
 FLIPS = (1, -1)
+FACING = 0.75  # cosine between walls' normals and the fingers' axis, at least
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,6 @@ def grasps_of(
     surface: Surface,
     grip: Pose,
     approaches: Sequence[np.ndarray],
-    facing: float,
     lowest_m: float = -np.inf,
     offsets: Sequence[float] = OFFSETS_M,
     rolls: Sequence[float] = (0.0,),
@@ -50,7 +51,6 @@ def grasps_of(
         surface: of the part.
         grip: pose of the gripper now; turning far from it costs.
         approaches: unit vectors along which the gripper may arrive.
-        facing: cosine between walls' normals and the fingers' axis, at least.
         lowest_m: height below which the point between the pads may not come.
         offsets: metres, of the walls from the middle of the gripper.
         rolls: radians, of the gripper about its approach.
@@ -58,7 +58,7 @@ def grasps_of(
     """
     found = []
     for approach in approaches:
-        found += _along(surface, grip, approach, facing, lowest_m, offsets, rolls, count)
+        found += _along(surface, grip, approach, lowest_m, offsets, rolls, count)
     return sorted(found, key=lambda grasp: grasp.cost)
 
 
@@ -66,7 +66,6 @@ def _along(
     surface: Surface,
     grip: Pose,
     approach: np.ndarray,
-    facing: float,
     lowest_m: float,
     offsets: Sequence[float],
     rolls: Sequence[float],
@@ -74,7 +73,7 @@ def _along(
 ) -> list[Grasp]:
     across = surface.normals - (surface.normals @ approach)[:, None] * approach
     length = np.linalg.norm(across, axis=1)
-    candidates = np.flatnonzero(length >= facing)
+    candidates = np.flatnonzero(length >= FACING)
     candidates = candidates[:: max(1, len(candidates) // count)]
     found = []
     for index, roll_rad in itertools.product(candidates.tolist(), rolls):
@@ -82,7 +81,7 @@ def _along(
         axis = np.cos(roll_rad) * normal + np.sin(roll_rad) * np.cross(approach, normal)
         side = np.cross(approach, axis)
         local = (surface.points - surface.points[index]) @ np.stack([axis, side, approach], 1)
-        middle_m = _middle(local, surface.normals @ axis, facing)
+        middle_m = _middle(local, surface.normals @ axis)
         if middle_m is None:
             continue
         for offset_m in offsets:
@@ -97,11 +96,11 @@ def _along(
     return found
 
 
-def _middle(local: np.ndarray, facing_axis: np.ndarray, facing: float) -> float | None:
+def _middle(local: np.ndarray, facing_axis: np.ndarray) -> float | None:
     """Return the middle of what pads would squeeze, relative to the first point; None if it is no grasp."""
     between = (abs(local[:, 1]) < PAD_HALF_WIDTH_M) & (local[:, 2] > PAD_M[0]) & (local[:, 2] < PAD_M[1])
     along, facing_axis = local[between, 0], facing_axis[between]
-    opposite = along[(facing_axis < -facing) & (along < 0)]
+    opposite = along[(facing_axis < -FACING) & (along < 0)]
     if not len(opposite):
         return None
     is_squeezed = abs(along - opposite.max() / 2) < OPEN_M[0] - SLACK_M  # about the nearest wall
@@ -109,8 +108,8 @@ def _middle(local: np.ndarray, facing_axis: np.ndarray, facing: float) -> float 
     if not len(along):
         return None
     low, high = along.min(), along.max()
-    touches_low = (facing_axis < -facing) & (along < low + TOUCH_M)
-    touches_high = (facing_axis > facing) & (along > high - TOUCH_M)
+    touches_low = (facing_axis < -FACING) & (along < low + TOUCH_M)
+    touches_high = (facing_axis > FACING) & (along > high - TOUCH_M)
     if min(touches_low.sum(), touches_high.sum()) < MIN_CONTACTS:
         return None
     return float((low + high) / 2)

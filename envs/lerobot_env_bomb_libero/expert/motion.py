@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_bomb.libero.episode import LiberoFailure
-from lerobot_bomb.libero.expert import CLOSE, OPEN
-from lerobot_env_bomb_libero.expert.arm import CLOSED_M, OPEN_M, Arm, Held, Pose, angle_of
+from lerobot_bomb.libero.expert import CLOSE, OPEN, angle_of
+from lerobot_env_bomb_libero.expert.arm import CLOSED_M, OPEN_M, Arm, Held, Pose
 from lerobot_env_bomb_libero.expert.grasps import Grasp
 from lerobot_env_bomb_libero.expert.paths import find_path, is_free_way
 

@@ -28,7 +28,6 @@ from lerobot_env_bomb_libero.expert.places import turned
 from lerobot_env_bomb_libero.expert.surfaces import surface_of
 
 TILTS_RAD = np.radians([25, 45]).tolist()  # of an approach, if none from above is free
-FACING = 0.75  # cosine between walls' normals and the fingers' axis, at least
 MAX_TRIED = 60  # grasps
 LOWEST_M = 0.0115  # of the point between the pads above what an object stands on
 TURNS_RAD = np.radians([0, 30, -30, 60, -60, 90, -90, 135, -135, 180]).tolist()  # of an object in its place
@@ -55,7 +54,7 @@ def choose_grasp(motion: Motion, body: int, places: Sequence[Pose]) -> Grasp:
     thing, is_any_free, fitting = arm.body(body), False, []
     for approaches in ([DOWN], tilted(TILTS_RAD)):
         count = MAX_POINTS // len(approaches) + 40
-        grasps = grasps_of(surface, motion.grip, approaches, FACING, lowest_m, count=count)
+        grasps = grasps_of(surface, motion.grip, approaches, lowest_m, count=count)
         for grasp in grasps[:MAX_TRIED]:
             if not motion.is_free(grasp):
                 continue

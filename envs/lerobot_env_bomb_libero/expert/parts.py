@@ -30,7 +30,6 @@ PROGRESS = 0.005  # of it, in a step
 LEAD = 0.25  # of it, that the gripper is ahead of a part
 TILTS_RAD = np.radians([55, 90]).tolist()  # of an approach, beside straight down
 ROLLS_RAD = (0.0, 0.6, -0.6)  # of the gripper about its approach
-FACING = 0.75  # cosine between walls' normals and the fingers' axis, at least
 MAX_POINTS = 60
 SHARES = (0.5, 1.0)  # of the way of a part, where the arm is looked at
 
@@ -118,7 +117,7 @@ def _choose_grasp(motion: Motion, part: MovingPart) -> Grasp:
     positions = [now + share * (part.target - now) for share in SHARES]
     poses = [part.pose_at(arm, position) for position in positions]
     grasps = grasps_of(
-        surface, motion.grip, [DOWN, *tilted(TILTS_RAD)], FACING,
+        surface, motion.grip, [DOWN, *tilted(TILTS_RAD)],
         offsets=(0.0,), rolls=ROLLS_RAD, count=MAX_POINTS,
     )  # fmt: skip
     for grasp in grasps:

@@ -5,7 +5,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from lerobot_env_bomb_libero.expert.arm import Arm, Held, Pose, angle_of, rotation_vector
+from lerobot_bomb.libero.expert import angle_of, rotation_vector
+from lerobot_env_bomb_libero.expert.arm import Arm, Held, Pose
 from lerobot_env_mujoco.rotations import rotation
 
 HEIGHTS_M = (0.0, 0.04, 0.08, 0.12, 0.18, 0.25, 0.32)  # above the higher end

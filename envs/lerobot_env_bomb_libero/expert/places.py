@@ -12,7 +12,6 @@ ABOVE_M = 0.25  # height over a target from which an object is lowered
 FALL_M = 0.4
 STEP_M, EXACT_M = 0.008, 0.0005
 MAX_OVERLAP_M = 0.02
-TURNS_RAD = tuple(np.radians([0, 30, -30, 60, -60, 90, -90, 135, -135, 180]).tolist())
 
 
 def resting_places(arm: Arm, goal: Sequence[str], body: int) -> list[Pose]:
