@@ -9,12 +9,14 @@ import av
 import pytest
 from rrd_files import read_rrd
 
+from lerobot_bomb.checkpoints.shipped import shipped_checkpoint
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.commands.results_files import read_record
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.record import ORIGIN
+from lerobot_bomb.viewing.replay import Replay
 
 
 @pytest.fixture(scope="module")
@@ -200,6 +202,15 @@ def test_a_policy_with_random_weights_cannot_be_had_again(
     path = rewritten(results("bomb_expert"), tmp_path / "r.jsonl", policy=policy)
     assert main(["replay", str(path), f"--output={tmp_path / 'x'}"]) == 1
     assert "act was built with random weights, which are in no file" in capsys.readouterr().err
+
+
+def test_a_shipped_checkpoint_is_found_on_another_machine(
+    results: Callable[..., Path], tmp_path: Path
+) -> None:
+    policy = json.loads(results("bomb_expert").read_text().splitlines()[0])["policy"]
+    there = policy | {"path": "/elsewhere/lerobot_bomb/checkpoints/weights/fdvla"}
+    path = rewritten(results("bomb_expert"), tmp_path / "r.jsonl", policy=there)
+    assert Replay(read_record(path, 1)).checkpoint == shipped_checkpoint("fdvla")
 
 
 def test_where_a_line_comes_from_is_named_by_its_fields() -> None:

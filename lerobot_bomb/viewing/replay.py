@@ -9,8 +9,10 @@ from typing import Any
 
 import gymnasium
 
+from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.environments import env_type
 from lerobot_bomb.envs.rollout import Agent, BatchAgent, one_of_batch
+from lerobot_bomb.results.names import shipped_name
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.viewing.episode import Viewed, ViewedRun
@@ -46,9 +48,16 @@ class Replay:
 
     @property
     def checkpoint(self) -> Path | None:
-        """Return the folder of the policy that ran; None if the record names none."""
+        """Return the folder of the policy that ran; None if the record names none.
+
+        Raises:
+            ValueError: the package no longer has the shipped checkpoint that ran.
+        """
         path = None if self.record.policy is None else self.record.policy.path
-        return self.policy_path or (Path(path) if path else None)
+        if self.policy_path or not path:
+            return self.policy_path
+        # a shipped checkpoint lies elsewhere on another machine
+        return Path(checkpoint_path(shipped_name(path) or path))
 
     def viewed(self, perturbations: str | None = None, seed: int | None = None) -> Viewed:
         """Return the record's episode; under other perturbations or of another seed.
