@@ -284,6 +284,14 @@ def test_a_stone_that_was_never_put_down_is_put_down_right() -> None:
     )
 
 
+def test_what_a_success_needs_is_not_called_unlooked_at() -> None:
+    masked = {"nothing": result(), "object: board": result("imprecise")}
+    looks = [moment("grasp", mm=seen(stone=12.0, board=0.1, background=0.0))]
+    told = verdict([{"result": result(), "moments": looks, "masked_episodes": masked}])
+    assert "It fails if any one of these is hidden in every step: the board." in told
+    assert any("it never looked at the background: hiding it" in sentence for sentence in told)
+
+
 def test_a_success_needs_no_other_words() -> None:
     masked = {"nothing": result(), "another: row": result("wrong_intersection")}
     episode = {"result": result(), "moments": [moment()], "masked_episodes": masked}

@@ -151,7 +151,14 @@ def with_masks(masked: Mapping[str, Values]) -> list[str]:
         return []
     if not clean["is_success"]:
         return [] if any(turning(clean, masked)) else [f"{WHATEVER}, it still fails."]
-    needed = [subject(name) for name, each in masked.items() if is_hidden(name) and not each["is_success"]]
+    needed = needed_masks(masked)
     if not needed:
         return [f"{WHATEVER}, it still succeeds."]
-    return [f"It fails if any one of these is hidden in every step: {', '.join(needed)}."]
+    return [f"It fails if any one of these is hidden in every step: {', '.join(map(subject, needed))}."]
+
+
+def needed_masks(masked: Mapping[str, Values]) -> list[str]:
+    """Return the masks that hide what a success needs."""
+    if NOTHING not in masked or not masked[NOTHING]["is_success"]:
+        return []
+    return [name for name, each in masked.items() if is_hidden(name) and not each["is_success"]]

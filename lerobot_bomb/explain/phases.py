@@ -15,7 +15,7 @@ DOES = {
     REACH: "moves with open or empty fingers",
     GRASP: "has its fingers around {}",
     CARRY: "carries {}",
-    PLACE: "puts down {}",
+    PLACE: "is at the target, or where it lets go of {}",
 }
 NEAR_M = BOARD.pitch_m  # of the place where a stone is put down: it is being placed
 CARRIED_M = 0.005  # from where it was taken: the stone is carried

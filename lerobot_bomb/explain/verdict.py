@@ -22,13 +22,14 @@ from lerobot_bomb.explain.effects import (
 from lerobot_bomb.explain.facts import (
     as_recorded,
     count_outcomes,
+    needed_masks,
     outcome,
     turned_right,
     with_masks,
     without_perturbations,
 )
 from lerobot_bomb.explain.limits import MAX_NAMES, RESTORES, SHARE, SMALLEST_MM, smallest_drop
-from lerobot_bomb.explain.mask_names import word_name
+from lerobot_bomb.explain.mask_names import OBJECT, mask_name, word_name
 from lerobot_bomb.tables import first_of, in_a_row
 
 STONE, BOARD_ITSELF = "stone", "board"
@@ -37,7 +38,8 @@ STONE, BOARD_ITSELF = "stone", "board"
 def verdict(episodes: Sequence[Values]) -> list[str]:
     """Return the sentences about one episode, or about several together."""
     moments = [moment for each in episodes for moment in each["moments"]]
-    return [*_endings(episodes), *reasons(moments)]
+    needed = needed_masks(episodes[0].get("masked_episodes", {})) if len(episodes) == 1 else []
+    return [*_endings(episodes), *reasons(moments, needed)]
 
 
 def _endings(episodes: Sequence[Values]) -> Iterator[str]:
@@ -53,11 +55,14 @@ def _endings(episodes: Sequence[Values]) -> Iterator[str]:
     yield from with_masks(masked)
 
 
-def reasons(moments: Sequence[Values]) -> list[str]:
-    """Return what the policy's actions depend on in these moments, sentence by sentence."""
+def reasons(moments: Sequence[Values], needed: Sequence[str] = ()) -> list[str]:
+    """Return what the policy's actions depend on in these moments, sentence by sentence.
+
+    `needed`: masks of what the episode needs. Of these it is not said that the policy never looks at them.
+    """
     objects, patches = _distinct(effects_of(moments, OBJECTS)), effects_of(moments, PATCHES)
     steps = "the one step examined" if len(moments) == 1 else f"the {len(moments)} steps examined"
-    seen = _objects(objects, steps) if objects else _patches(patches)
+    seen = _objects(objects, steps, needed) if objects else _patches(patches)
     words = _words(effects_of(moments, WORDS), objects or patches)
     return [*seen, *words, *_followed(moments), *_pointing(moments), *_heads(moments)]
 
@@ -83,12 +88,16 @@ def _thing(name: str) -> str:
     return {"target": "the target intersection", "other stones": "the other stones"}.get(name, f"the {name}")
 
 
-def _objects(effects: Sequence[Effect], steps: str) -> Iterator[str]:
+def _objects(effects: Sequence[Effect], steps: str, needed: Sequence[str]) -> Iterator[str]:
     """Yield what it looks at and what it never looked at; the latter first if that is the stone."""
     used = [each for each in effects if each.matters]
     unsure = [each for each in effects if each.is_open]
     unused = sorted(
-        [each for each in effects if not each.matters and not each.is_open],
+        [
+            each
+            for each in effects
+            if not each.matters and not each.is_open and mask_name(OBJECT, each.name) not in needed
+        ],
         key=lambda each: each.name != STONE,
     )
     if not used:
