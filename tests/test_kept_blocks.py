@@ -17,7 +17,6 @@ from lerobot_bomb.commands import main as cli
 from lerobot_bomb.data import resumable
 from lerobot_bomb.data.kept_blocks import damaged_blocks, find_gaps, finished_blocks
 from lerobot_bomb.data.record import record
-from lerobot_bomb.data.recorded_blocks import recording_layout
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.unfinished import METADATA_FILE, unfinished_folder
 
@@ -125,7 +124,7 @@ def test_a_merge_that_writes_each_file_once_is_lerobots(
     for kind in ("DATA", "VIDEO"):
         monkeypatch.setattr(aggregate, f"DEFAULT_{kind}_FILE_SIZE_IN_MB", file_mb)
     before = vars(aggregate).copy()
-    layout, there = recording_layout(RECORDING), finished_blocks(recorded / "x.recording")
+    layout, there = RECORDING.layout(), finished_blocks(recorded / "x.recording")
     blocks.merge_blocks(layout, there, tmp_path / "once")
     assert vars(aggregate) == before
     monkeypatch.setattr(blocks, "merged_at_once", nullcontext)

@@ -35,10 +35,11 @@ from lerobot_bomb.commands.record_libero import (
     libero_recording,
     refuse_libero_flags,
 )
+from lerobot_bomb.data.base_recording import BaseRecording
 from lerobot_bomb.data.kept_blocks import Progress, read_progress
 from lerobot_bomb.data.parts import Part, check_part, join, num_whole_blocks, record_part, unfinished_parts
 from lerobot_bomb.data.record import record
-from lerobot_bomb.data.recorded_blocks import AnyRecording, BehaviorPolicy, EpisodeSource, describe_failures
+from lerobot_bomb.data.recorded_blocks import BehaviorPolicy, EpisodeSource, describe_failures
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import (
     block_episodes,
@@ -138,7 +139,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _recording(args: argparse.Namespace) -> AnyRecording:
+def _recording(args: argparse.Namespace) -> BaseRecording:
     if args.env_type == BOMB_LIBERO:
         parser = argparse.ArgumentParser()
         add_arguments(parser)
@@ -165,7 +166,7 @@ def _bomb_recording(args: argparse.Namespace) -> Recording:
     return Recording(**given)
 
 
-def _print(recording: AnyRecording, progress: Progress, where: Path, num_before: int = 0) -> None:
+def _print(recording: BaseRecording, progress: Progress, where: Path, num_before: int = 0) -> None:
     """Print what was recorded, after `num_before` episodes that other parts tried."""
     conditions, scenes = len(recording.conditions), recording.scenes
     first = recording.seed + num_before // conditions * scenes

@@ -10,15 +10,9 @@ from lerobot.processor.env_processor import LiberoProcessorStep
 from lerobot.utils.constants import ACTION, OBS_PREFIX, OBS_STATE
 
 from lerobot_bomb import __version__
-from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
-from lerobot_bomb.data.libero_conversion import KEYS, libero_layout
-from lerobot_bomb.data.libero_recording import IMAGE_NAMES, LiberoRecording, LiberoRollout
-
-
-def libero_recording_layout(recording: LiberoRecording) -> DatasetLayout:
-    """Return the layout, which is that of converted demonstrations."""
-    shape = (recording.observation_height, recording.observation_width, 3)
-    return libero_layout(recording.repo_id, shape, use_videos=not recording.images)
+from lerobot_bomb.data.blocks import RecordedEpisode
+from lerobot_bomb.data.libero_conversion import KEYS
+from lerobot_bomb.data.libero_recording import IMAGE_NAMES, LiberoRollout
 
 
 def libero_episode(rollout: LiberoRollout) -> RecordedEpisode:

@@ -1,12 +1,8 @@
 """Parameters of a recording of LIBERO's scripted expert, and its episodes as workers run them."""
 
-import itertools
-import json
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -15,33 +11,26 @@ from lerobot_bomb import __version__
 from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE, PIXELS
 from lerobot_bomb.bomb.streams import recorder_noise
 from lerobot_bomb.conditions import NONE
-from lerobot_bomb.data.resumable import check_repo_id
-from lerobot_bomb.envs.rollout import Agent, run_episode
+from lerobot_bomb.data.base_recording import BaseRecording
+from lerobot_bomb.envs.rollout import Agent, Expert, run_episode
 from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.libero.episode import LIBERO_PROTOCOL_VERSION, MOTION_DIMS, TASKS_PER_SUITE, LiberoSpec
 from lerobot_bomb.libero.expert import LiberoState, libero_expert_action
 from lerobot_bomb.results.libero import SIMULATOR, LiberoResult
 from lerobot_bomb.results.origin import installed_versions
 
+if TYPE_CHECKING:
+    from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
+
 # Importing the part before the colon registers the id; no module of the core imports an environment.
 ENV_ID = "lerobot_env_bomb_libero:bomb_libero/Libero-v0"
 IMAGE_NAMES = ("image", "image2")  # of LeRobot's environment
-MAX_NOISE = 1.0  # beyond it the noise exceeds the largest action
 
 
 @dataclass(frozen=True)
-class LiberoRecording:
-    """Parameters that determine a recording frame by frame."""
+class LiberoRecording(BaseRecording):
+    """Parameters that determine a recording of LIBERO frame by frame."""
 
-    kind: ClassVar[str] = "recording"
-    # what the recorder asks of every recording: frames of an episode belong together, and the expert acts
-    scenes: ClassVar[int] = 1
-    static: ClassVar[int] = 0
-    relabel: ClassVar[None] = None
-
-    repo_id: str
-    episodes: int
-    seed: int = 0
     task: str = SUITES[0]
     task_ids: tuple[int, ...] = ()  # in the suite, each run from every seed; empty: all
     perturbations: tuple[str, ...] = (NONE,)  # conditions, each run from every seed, with every task
@@ -56,22 +45,12 @@ class LiberoRecording:
     simulator_versions: dict[str, str | None] = field(default_factory=partial(installed_versions, SIMULATOR))
 
     def __post_init__(self) -> None:
-        check_repo_id(self.repo_id)
-        if self.episodes < 1:
-            raise ValueError(f"--episodes={self.episodes} must be at least 1")
-        if not self.perturbations:
-            raise ValueError('--env.perturbations=[] names no condition; leave it out or give ["none"]')
-        if not 0 <= self.noise <= MAX_NOISE:
-            raise ValueError(f"--noise={self.noise} must lie in 0..{MAX_NOISE:g}")
+        self._check(self.perturbations, self.noise)
         for name in ("observation_height", "observation_width"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--env.{name}={getattr(self, name)} must be at least 1")
         if len(set(self.conditions)) < len(self.conditions):
             raise ValueError("--env.perturbations or --env.task_ids names something twice")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the recording as JSON values."""
-        return json.loads(json.dumps(asdict(self)))
 
     @property
     def conditions(self) -> list[LiberoSpec]:
@@ -83,22 +62,15 @@ class LiberoRecording:
             for condition in self.perturbations
         ]
 
-    def specs(self, num_tried: int) -> Iterator[LiberoSpec]:
-        """Yield the episodes to try after the first `num_tried`: seeds count up, each with all conditions."""
-        conditions = self.conditions
-        for tried in itertools.count(num_tried):
-            seeds_done, condition = divmod(tried, len(conditions))
-            yield replace(conditions[condition], seed=self.seed + seeds_done)
-
-    @property
-    def settings(self) -> "LiberoRollouts":
-        """Return how its episodes are run."""
+    def rollouts(self, _: Expert) -> "LiberoRollouts":
         size = {"observation_height": self.observation_height, "observation_width": self.observation_width}
         return LiberoRollouts(self.noise, {"obs_type": "pixels_agent_pos"} | size)
 
-    def flag_names(self) -> AbstractContextManager[None]:
-        """Name flags in errors as they were given, which they are."""
-        return nullcontext()
+    def layout(self) -> "DatasetLayout":
+        from lerobot_bomb.data.libero_conversion import libero_layout  # LeRobot: seconds
+
+        shape = (self.observation_height, self.observation_width, 3)
+        return libero_layout(self.repo_id, shape, use_videos=not self.images)
 
 
 @dataclass(frozen=True)
@@ -115,6 +87,12 @@ class LiberoRollout:
     def num_steps(self) -> int:
         """Number of frames to store."""
         return len(self.actions)
+
+    def episode(self) -> "RecordedEpisode":
+        """Return the episode that the dataset stores."""
+        from lerobot_bomb.data.libero_dataset import libero_episode  # LeRobot: seconds
+
+        return libero_episode(self)
 
 
 @dataclass(frozen=True)

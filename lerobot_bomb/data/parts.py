@@ -14,13 +14,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
+from lerobot_bomb.data.base_recording import BaseRecording
 from lerobot_bomb.data.kept_blocks import Progress, block_damage, block_path, find_gaps, reached
 from lerobot_bomb.data.recorded_blocks import (
     ANY_NUMBER,
-    AnyRecording,
     EpisodeSource,
     record_blocks,
-    recording_layout,
 )
 from lerobot_bomb.data.resumable import block_episodes, grow, growing
 from lerobot_bomb.data.unfinished import (
@@ -41,7 +40,7 @@ class Part:
 
     kind: ClassVar[str] = "recording"
 
-    recording: AnyRecording
+    recording: BaseRecording
     index: int
     number: int  # of parts
 
@@ -63,7 +62,7 @@ class Part:
         return parts_folder(root) / f"{self.index}-of-{self.number}.recording"
 
 
-def num_whole_blocks(recording: AnyRecording) -> int:
+def num_whole_blocks(recording: BaseRecording) -> int:
     """Return the number of whole blocks of a recording in which no episode fails."""
     return recording.episodes // len(block_episodes(0))
 
@@ -92,7 +91,7 @@ def check_part(part: Part, root: Path) -> None:
     """Raise a ValueError unless a part can be recorded beside `root`, with what lies there."""
     flag, most = f"--shard={part}", num_whole_blocks(part.recording)
     if part.number > most:
-        scenes = f" of {part.recording.scenes} scenes" if part.recording.static else ""
+        scenes = f" of {part.recording.scenes} scenes" if part.recording.scenes > 1 else ""
         raise ValueError(
             f"{flag}: a part has at least {len(block_episodes(0))} episodes{scenes}, and "
             f"{part.recording.episodes} make {most} parts at most"
@@ -112,7 +111,7 @@ def check_part(part: Part, root: Path) -> None:
         _check_same(flag, Part(part.recording, index, number), root)
 
 
-def join(recording: AnyRecording, root: Path, source: EpisodeSource) -> Progress:
+def join(recording: BaseRecording, root: Path, source: EpisodeSource) -> Progress:
     """Join the parts into the dataset at `root`, replace failed episodes, and delete the parts.
 
     Raises:
@@ -131,7 +130,7 @@ def join(recording: AnyRecording, root: Path, source: EpisodeSource) -> Progress
         root,
         resume=root.exists() or unfinished_folder(root).exists(),
         write=partial(record_blocks, recording, source=source, numbers=numbers, most=most),
-        layout=partial(recording_layout, recording),
+        layout=recording.layout,
         parts=folders,
     )
     for index, number in _found(root):
@@ -161,7 +160,7 @@ def unfinished_parts(parts: list[Part], root: Path) -> dict[Part, str]:
     return found
 
 
-def _whole_parts(recording: AnyRecording, root: Path) -> list[Part]:
+def _whole_parts(recording: BaseRecording, root: Path) -> list[Part]:
     """Return the parts of a recording, once all of them are there and finished."""
     folder, found = parts_folder(root), _found(root)
     numbers = sorted({number for _, number in found})

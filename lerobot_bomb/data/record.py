@@ -7,21 +7,20 @@ from functools import partial
 from pathlib import Path
 
 from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.data.base_recording import BaseRecording
 from lerobot_bomb.data.kept_blocks import Progress
 from lerobot_bomb.data.parts import check_no_parts
 from lerobot_bomb.data.recorded_blocks import (
-    AnyRecording,
     BehaviorPolicy,
     EpisodeSource,
     record_blocks,
-    recording_layout,
 )
 from lerobot_bomb.data.resumable import grow
 from lerobot_bomb.envs.rollout import Expert
 
 
 def record(
-    recording: AnyRecording,
+    recording: BaseRecording,
     root: Path,
     num_workers: int = 1,
     resume: bool = False,
@@ -44,5 +43,5 @@ def record(
         root,
         resume,
         write=partial(record_blocks, recording, source=source, most=recording.episodes),
-        layout=partial(recording_layout, recording),
+        layout=recording.layout,
     )

@@ -14,23 +14,19 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.data.base_recording import BaseRecording
 from lerobot_bomb.data.kept_blocks import Progress, episodes_before, reached
-from lerobot_bomb.data.libero_recording import LiberoRecording, LiberoRollout
-from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import add_block, block_episodes, missing_blocks
-from lerobot_bomb.data.rollout_pool import Rollout, RolloutPool, Rollouts, RolloutSettings, RolloutsHere
+from lerobot_bomb.data.rollout_pool import AnyRollout, RolloutPool, RolloutsHere
 from lerobot_bomb.envs.rollout import Agent, Expert
 
 if TYPE_CHECKING:
-    from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
+    from lerobot_bomb.data.blocks import RecordedEpisode
 
 ANY_NUMBER = sys.maxsize
 # the expert counts as broken if, after so many episodes, fewer succeed
 MIN_TRIED = 20
 MIN_SUCCESS_RATE = 0.1
-
-
-type AnyRecording = Recording | LiberoRecording
 
 
 @dataclass(frozen=True)
@@ -49,29 +45,16 @@ class EpisodeSource:
     expert: Expert = expert_action
     behavior: BehaviorPolicy | None = None  # the expert says what it would have done
 
-    def rollouts(self, recording: AnyRecording, num_tried: int) -> RolloutPool | RolloutsHere:
+    def rollouts(self, recording: BaseRecording, num_tried: int) -> RolloutPool | RolloutsHere:
         """Return the episodes of a recording after the first `num_tried`."""
-        settings = self.settings(recording)
-        specs: Iterator[Any] = recording.specs(num_tried)
-        if self.behavior is None or not isinstance(settings, RolloutSettings):
+        settings, specs = recording.rollouts(self.expert), recording.specs(num_tried)
+        if self.behavior is None:
             return RolloutPool(settings, specs, self.num_workers)
         return RolloutsHere(settings, specs, self.behavior.begin, self.behavior.agent)
 
-    def settings(self, recording: AnyRecording) -> Rollouts:
-        """Return how a recording's episodes are run."""
-        if isinstance(recording, LiberoRecording):
-            return recording.settings
-        return RolloutSettings(
-            recording.render_options,
-            recording.noise,
-            self.expert,
-            recording.scenes if recording.static else 0,
-            recording.pointing,
-        )
-
 
 def record_blocks(
-    recording: AnyRecording,
+    recording: BaseRecording,
     folder: Path,
     source: EpisodeSource,
     numbers: range = range(ANY_NUMBER),
@@ -85,7 +68,7 @@ def record_blocks(
     if not gaps:
         return
     # MuJoCo's backend is chosen here, or its absence reported; the workers inherit the choice
-    settings = source.settings(recording)
+    settings = recording.rollouts(source.expert)
     with recording.flag_names():
         for spec in recording.conditions:
             settings.make_env(spec).close()
@@ -97,19 +80,19 @@ def record_blocks(
 
 
 def _fill(
-    recording: AnyRecording,
+    recording: BaseRecording,
     folder: Path,
     source: EpisodeSource,
     gap: range,
     most: int,
-    successes: "Callable[[Iterable[Rollout | LiberoRollout], int, Progress], Iterator[RecordedEpisode]]",
+    successes: "Callable[[Iterable[AnyRollout], int, Progress], Iterator[RecordedEpisode]]",
 ) -> None:
     """Make the blocks of a gap, until the folder holds `most` episodes."""
     left = most - episodes_before(folder, gap.start)
     if left == 0:
         return
     with source.rollouts(recording, block_episodes(gap.start).start) as pool:
-        layout = recording_layout(recording)  # takes seconds, in which the workers run
+        layout = recording.layout()  # takes seconds, in which the workers run
         for number in gap:
             made = add_block(folder, layout, number, partial(successes, pool, left))
             left -= made.num_episodes
@@ -118,14 +101,14 @@ def _fill(
 
 
 def _successes(
-    run: Progress, bar: tqdm, pool: Iterable[Rollout | LiberoRollout], most: int, progress: Progress
+    run: Progress, bar: tqdm, pool: Iterable[AnyRollout], most: int, progress: Progress
 ) -> "Iterator[RecordedEpisode]":
     """Yield a block's successful rollouts, at most `most`; count the failed ones on the way."""
     for rollout in islice(pool, len(block_episodes(0))):
         if rollout.num_steps:
             progress.num_episodes += 1
             run.num_episodes += 1
-            yield _recorded(rollout)
+            yield rollout.episode()
             bar.update()
         else:
             failure = {"seed": rollout.result.spec.seed, "failure": rollout.result.failure}
@@ -135,16 +118,6 @@ def _successes(
             _check_success_rate(run)
         if progress.num_episodes == most:
             return
-
-
-def _recorded(rollout: "Rollout | LiberoRollout") -> "RecordedEpisode":
-    if isinstance(rollout, LiberoRollout):
-        from lerobot_bomb.data.libero_dataset import libero_episode
-
-        return libero_episode(rollout)
-    from lerobot_bomb.data.rollout_dataset import rollout_episode
-
-    return rollout_episode(rollout)
 
 
 def _check_success_rate(progress: Progress) -> None:
@@ -166,14 +139,3 @@ def describe_failures(failures: list[dict[str, Any]]) -> str:
         f"{len(numbers)} {name} (seeds {', '.join(numbers)})" for name, numbers in sorted(seeds.items())
     )
     return f"{len(failures)} failed and were left out: {classes}"
-
-
-def recording_layout(recording: AnyRecording) -> "DatasetLayout":
-    """Return the layout of a recording's dataset."""
-    if isinstance(recording, LiberoRecording):
-        from lerobot_bomb.data.libero_dataset import libero_recording_layout
-
-        return libero_recording_layout(recording)
-    from lerobot_bomb.data.rollout_dataset import rollout_layout
-
-    return rollout_layout(recording)

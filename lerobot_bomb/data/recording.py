@@ -1,12 +1,9 @@
 """Parameters of a recording, and the episodes that it tries."""
 
-import itertools
-import json
-from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING
 
 from lerobot_bomb import __version__
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, EpisodeSpec
@@ -14,23 +11,22 @@ from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
 from lerobot_bomb.bomb.suite import specs_of_tasks, suites_of, task_version
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import ALL, NONE
-from lerobot_bomb.data.resumable import check_repo_id
+from lerobot_bomb.data.base_recording import BaseRecording
+from lerobot_bomb.data.rollout_pool import RolloutSettings
+from lerobot_bomb.envs.rollout import Expert
 from lerobot_bomb.flags import one_of, rewording_errors
 from lerobot_bomb.results.origin import installed_version
 
+if TYPE_CHECKING:
+    from lerobot_bomb.data.blocks import DatasetLayout
+
 SCENES = 100  # static scenes that are stored as an episode
-MAX_NOISE = 1.0  # beyond it the noise exceeds the largest action
 
 
 @dataclass(frozen=True)
-class Recording:
-    """Parameters that determine a recording frame by frame."""
+class Recording(BaseRecording):
+    """Parameters that determine a recording of BOMB frame by frame."""
 
-    kind: ClassVar[str] = "recording"
-
-    repo_id: str
-    episodes: int
-    seed: int = 0
     task: str = "place"
     robot: str = "scara"
     control_mode: str = "relative"
@@ -61,18 +57,9 @@ class Recording:
     mujoco_version: str | None = field(default_factory=partial(installed_version, "mujoco"))
 
     def __post_init__(self) -> None:
-        check_repo_id(self.repo_id)
         if self.static:
             self._of_scenes()
-        if self.episodes < 1:
-            raise ValueError(f"--episodes={self.episodes} must be at least 1")
-        if not self.perturbations:
-            raise ValueError('--env.perturbations=[] names no condition; leave it out or give ["none"]')
-        if not 0 <= self.noise <= MAX_NOISE:
-            raise ValueError(
-                f"--noise={self.noise} must lie in 0..{MAX_NOISE:g}; "
-                "it is a standard deviation in units of the largest step, 40 mm"
-            )
+        self._check(self.perturbations, self.noise)
         one_of("--env.task", self.task, (*SUITES, ALL))
         if self.task_ids and self.task == ALL:
             raise ValueError(
@@ -118,22 +105,20 @@ class Recording:
             success_tolerance_mm=self.success_tolerance_mm,
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the recording as JSON values."""
-        return json.loads(json.dumps(asdict(self)))
-
     @property
     def conditions(self) -> list[EpisodeSpec]:
         """Return the specs that every seed is run with; they hold the first seed."""
         tasks = [task for spec in self.suite_specs for task in specs_of_tasks(spec, self.task_ids)]
         return [replace(task, perturbations=text) for task in tasks for text in self.perturbations]
 
-    def specs(self, num_tried: int) -> Iterator[EpisodeSpec]:
-        """Yield the episodes to try after the first `num_tried`: seeds count up, each with all conditions."""
-        conditions = self.conditions
-        for tried in itertools.count(num_tried):
-            seeds_done, condition = divmod(tried, len(conditions))
-            yield replace(conditions[condition], seed=self.seed + seeds_done * self.scenes)
+    def rollouts(self, expert: Expert) -> RolloutSettings:
+        scenes = self.scenes if self.static else 0
+        return RolloutSettings(self.render_options, self.noise, expert, scenes, self.pointing)
+
+    def layout(self) -> "DatasetLayout":
+        from lerobot_bomb.data.rollout_dataset import rollout_layout  # LeRobot: seconds
+
+        return rollout_layout(self)
 
     @property
     def render_options(self) -> RenderOptions:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from typing import Any, ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 import gymnasium
 import numpy as np
@@ -33,6 +33,25 @@ from lerobot_bomb.bomb.streams import Stream, generator, recorder_noise
 from lerobot_bomb.envs.rollout import Agent, Expert, add_noise, expert_agent, make_env, run_episode
 from lerobot_bomb.results.bomb import EpisodeResult
 
+if TYPE_CHECKING:
+    from lerobot_bomb.data.blocks import RecordedEpisode
+
+
+class AnyRollout(Protocol):
+    """An episode that was run."""
+
+    @property
+    def result(self) -> Any: ...
+
+    @property
+    def num_steps(self) -> int:
+        """Number of frames to store; 0: the episode failed."""
+        ...
+
+    def episode(self) -> "RecordedEpisode":
+        """Return the episode that the dataset stores."""
+        ...
+
 
 class Rollouts(Protocol):
     """Settings of an environment's rollouts; with a spec they determine one."""
@@ -43,8 +62,8 @@ class Rollouts(Protocol):
         """Make the environment of a spec's episodes."""
         ...
 
-    def collect(self, env: gymnasium.Env, spec: Any, agent: Agent | None = None) -> Any:
-        """Run a spec's episode; return a picklable rollout with `result` and `num_steps`."""
+    def collect(self, env: gymnasium.Env, spec: Any, agent: Agent | None = None) -> AnyRollout:
+        """Run a spec's episode; return a picklable rollout."""
         ...
 
 
@@ -83,6 +102,12 @@ class Rollout:
     def num_steps(self) -> int:
         """Number of frames to store."""
         return len(self.instructions)
+
+    def episode(self) -> "RecordedEpisode":
+        """Return the episode that the dataset stores."""
+        from lerobot_bomb.data.rollout_dataset import rollout_episode  # LeRobot: seconds
+
+        return rollout_episode(self)
 
 
 def collect(
@@ -169,8 +194,8 @@ class RolloutsHere:
 
     def __init__(
         self,
-        settings: RolloutSettings,
-        specs: Iterator[EpisodeSpec],
+        settings: Rollouts,
+        specs: Iterator[Any],
         begin: Callable[[], None] = lambda: None,
         agent: Agent | None = None,
     ) -> None:
@@ -182,7 +207,7 @@ class RolloutsHere:
     def __exit__(self, *_: object) -> None:
         self._worker.close()
 
-    def __iter__(self) -> Iterator[Rollout]:
+    def __iter__(self) -> Iterator[AnyRollout]:
         for spec in self._specs:
             self._begin()
             rollout = self._worker.rollout(spec)
