@@ -227,6 +227,22 @@ def test_dynamics_delay_actions_and_make_objects_heavier_or_lighter(env: Any) ->
     assert np.allclose(factor, 2.5) or np.allclose(factor, 1 / 2.5)
 
 
+def test_without_drawing_states_are_the_same_and_films_are_drawn(
+    env: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run() -> tuple[dict[str, Any], np.ndarray]:
+        begin(env, "light:2", 3)
+        observation, *_ = env.step(ACTIONS[0])
+        return observation, env.render()
+
+    (shown, film), _ = run(), monkeypatch.setattr(env._scene, "_draws", False)
+    black, same_film = run()
+    assert not any(image.any() for image in black["pixels"].values())
+    np.testing.assert_array_equal(flat(shown["robot_state"]), flat(black["robot_state"]))
+    assert film.any()
+    assert (film != same_film).mean() < 0.05  # a simulator step apart
+
+
 def test_what_the_gripper_touches_is_told_by_name(env: Any) -> None:
     begin(env, NONE, 6)
     scene = env._scene

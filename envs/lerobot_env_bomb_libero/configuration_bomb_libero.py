@@ -88,7 +88,8 @@ class BombLiberoEnvConfig(EvaluatedEnv, LiberoEnv):
 
     def _known_late(self, num_envs: int) -> list[dict[str, Any]]:
         late = super()._known_late(num_envs)
-        return [{**each, "is_guided": True} for each in late] if self._is_guided else late
+        # who reads the true state does not look at images
+        return [{**each, "is_guided": True, "draws": False} for each in late] if self._is_guided else late
 
     def _import_env(self) -> type:
         prepare_libero(self.suites)

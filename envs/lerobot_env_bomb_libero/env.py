@@ -56,6 +56,7 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
         render_mode: str | None = "rgb_array",
         policy: PolicyIdentity | None = None,
         is_guided: bool = False,
+        draws: bool = True,
     ):
         """Make the environment of a task.
 
@@ -66,12 +67,14 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
             render_mode: as Gymnasium has it.
             policy: that acts, for the records.
             is_guided: add what the scripted expert reads to observations, as `environment_state`.
+            draws: draw the images of observations, most of a step's time; else they are black.
         """
         from libero.libero import benchmark  # slow
 
         suite = benchmark.get_benchmark_dict()[spec.suite]()
         self._scene = LiberoScene(
             list(transforms_of(spec.condition).values()),
+            draws,
             task_suite=suite,
             task_id=spec.task_id,
             task_suite_name=spec.suite,

@@ -49,10 +49,11 @@ class LiberoScene(LiberoEnv):
     Images that nobody sees are not drawn.
     """
 
-    def __init__(self, kinds: Sequence[type[LiberoTransform]], **kwargs: Any):
+    def __init__(self, kinds: Sequence[type[LiberoTransform]], draws: bool = True, **kwargs: Any):
+        """Make the scene; with `draws=False` the images of its observations are black."""
         super().__init__(**kwargs)
         self._kinds = kinds  # of the axes that may be on
-        self._draws = True
+        self._draws = draws
         self._compiled: dict[str, np.ndarray] = {}
         self._textures: dict[int, np.ndarray] = {}  # of those that were changed, as compiled
 
@@ -62,7 +63,7 @@ class LiberoScene(LiberoEnv):
         self._restore()
         env = self._built
         env.seed(seed)
-        with self._drawing_off():
+        with self._drawing(False):
             self._place()
             for each in transforms:
                 each.edit(self)
@@ -278,12 +279,25 @@ class LiberoScene(LiberoEnv):
         return draw
 
     @contextmanager
-    def _drawing_off(self) -> Iterator[None]:
-        self._draws = False
+    def _drawing(self, on: bool) -> Iterator[None]:
+        before, self._draws = self._draws, on
         try:
             yield
         finally:
-            self._draws = True
+            self._draws = before
+
+    def render(self) -> np.ndarray:
+        """(H, W, 3) uint8: the first camera's image, upright.
+
+        It is that of the last observation. Where that was not drawn, it shows the present state, up to a
+        simulator step of 2 ms later.
+        """
+        if self._draws:
+            return super().render()
+        self._ensure_env()
+        with self._drawing(True):
+            image = self._built.env._observables[self.camera_name[0]]._sensor({})
+        return image[::-1, ::-1]
 
     def _remember(self) -> None:
         """Remember the model as compiled."""
