@@ -24,8 +24,8 @@ class RelativeVlaConfig(VlaConfig):
     relative_state_indices: list[int] | None = None
 
     def methods(self) -> list[str]:
-        relation = "relative" if self.relative_actions else "not relative"
-        return [*super().methods(), f"actions {relation} to the state"]
+        actions = "relative to the state" if self.relative_actions else "as in the dataset"
+        return [*super().methods(), f"actions {actions}"]
 
     def relative_dims(self) -> dict[int, int]:
         """Return {relative action dimension: its state dimension}.
