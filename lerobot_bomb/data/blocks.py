@@ -32,9 +32,10 @@ from lerobot_bomb.compat.own.recording import (
     batched_embedding,
     datasets_cache,
     mergeable_arrays,
-    sampled_image_statistics,
+    statistics_by,
     without_statistics,
 )
+from lerobot_bomb.data.running_statistics import ExactStats
 from lerobot_bomb.data.statistics import write_image_statistics, write_statistics
 
 ENCODER_THREADS = 1  # per camera, which keeps two cores busy; see benchmarks/record_speed.py
@@ -96,7 +97,7 @@ def write_block(layout: DatasetLayout, root: Path, episodes: Iterable[RecordedEp
         _quiet_libraries(),
         _logged_errors(),
         _temporary_files_beside(root),
-        sampled_image_statistics(),
+        statistics_by(ExactStats),
         without_statistics(layout.arrays),
         batched_embedding(),
     ):

@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from datasets import Dataset, config
 from datasets.table import embed_table_storage
 from lerobot.datasets import LeRobotDataset, aggregate, compute_stats, dataset_writer, io_utils
@@ -15,27 +14,16 @@ from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import to_parquet_with_hf_images
 from lerobot.utils.constants import DEFAULT_FEATURES
 
-STATISTICS_SIZE = 128  # pixels
-
-
-def sample_pixels(image: np.ndarray) -> np.ndarray:
-    """(C, H, W) -> every n-th pixel of every n-th row, so that about STATISTICS_SIZE of each are left."""
-    stride = max(1, max(image.shape[1:]) // STATISTICS_SIZE)
-    return image[:, ::stride, ::stride]
-
 
 @contextmanager
-def sampled_image_statistics() -> Iterator[None]:
-    """Let LeRobot's video encoder take image statistics from a sample of the pixels.
-
-    LeRobot itself samples only from 300 pixels on; all pixels of a 256x256 frame cost 5 ms of one core.
-    """
-    usual = compute_stats.auto_downsample_height_width
-    compute_stats.auto_downsample_height_width = sample_pixels
+def statistics_by(kind: type[compute_stats.RunningQuantileStats]) -> Iterator[None]:
+    """Let LeRobot compute the statistics of episodes by another class."""
+    usual = compute_stats.RunningQuantileStats
+    compute_stats.RunningQuantileStats = kind
     try:
         yield
     finally:
-        compute_stats.auto_downsample_height_width = usual
+        compute_stats.RunningQuantileStats = usual
 
 
 @contextmanager
