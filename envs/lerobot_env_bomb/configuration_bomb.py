@@ -24,6 +24,7 @@ from lerobot_bomb.checkpoints.env_config import EvaluatedEnv
 from lerobot_bomb.checkpoints.environment import check_acting_policy, side_of_images
 from lerobot_bomb.conditions import ALL
 from lerobot_env_bomb.fetch_files import check_robot
+from lerobot_env_bomb.simulators import check_simulator
 
 
 @EnvConfig.register_subclass("bomb")
@@ -40,6 +41,8 @@ class BombEnvConfig(EvaluatedEnv, EnvConfig):
     fps: int = DEFAULT_FPS
     # arm: scara, or fetch (of gymnasium-robotics; needs MuJoCo 3)
     robot: str = "scara"
+    # physics: mujoco, or sapien (PhysX; extra sapien); MuJoCo draws both
+    simulator: str = "mujoco"
     # relative: dx, dy, dz in units of 40 mm; absolute: x, y, z in metres
     control_mode: str = "relative"
     # intersections, templates and table colours to draw from: all, train or heldout
@@ -63,6 +66,7 @@ class BombEnvConfig(EvaluatedEnv, EnvConfig):
         for spec in (spec for specs in self.groups.values() for spec in specs.values()):
             find_suite(spec.suite).check(spec)
             check_robot(spec)
+            check_simulator(spec)
         geometry_shapes(self.render_options)
 
     def take_image_size(self, config: PreTrainedConfig | None) -> None:
@@ -115,6 +119,7 @@ class BombEnvConfig(EvaluatedEnv, EnvConfig):
             target=None if self.target is None else cast("tuple[int, int]", tuple(self.target)),
             color=self.color,
             success_tolerance_mm=self.success_tolerance_mm,
+            simulator=self.simulator,
         )
         return specs_of_tasks(spec, self.task_ids or [])
 

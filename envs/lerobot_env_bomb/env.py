@@ -22,7 +22,7 @@ from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
 from lerobot_bomb.results.bomb import EpisodeResult
-from lerobot_bomb.results.origin import PolicyIdentity
+from lerobot_bomb.results.origin import PolicyIdentity, installed_version
 from lerobot_env_bomb.actuator import Actuator
 from lerobot_env_bomb.alternatives import alternatives
 from lerobot_env_bomb.axes.dynamics import Dynamics
@@ -31,6 +31,7 @@ from lerobot_env_bomb.object_masks import object_masks
 from lerobot_env_bomb.perturb import PerturbedEpisode, sample_episode
 from lerobot_env_bomb.render import CameraRenderer, compose_caption, extrinsics, intrinsics
 from lerobot_env_bomb.scene import Scene
+from lerobot_env_bomb.simulators import check_simulator
 from lerobot_env_bomb.spaces import action_space, observation_space
 from lerobot_env_bomb.static_scene import StaticScene, draw_static, starting_scene
 
@@ -82,6 +83,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         suite = find_suite(spec.suite)
         suite.check(spec)
         check_robot(spec)
+        check_simulator(spec)
         super().__init__(spec, spec.suite, results_path, render_mode)
         self._num_substeps = PHYSICS_HZ // spec.fps
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": spec.fps}
@@ -110,7 +112,8 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return self._observe(), self._result(self._run)
 
     def _set_up(self, episode: PerturbedEpisode, start: StaticScene) -> None:
-        scene = self._current_run.scene if self._current_run is not None else Scene(self._spec.robot)
+        run, spec = self._current_run, self._spec
+        scene = Scene(spec.robot, spec.simulator) if run is None else run.scene
         scene.reset(start.layout, episode.perturbation.model_edits, episode.pattern)
         if start.held is not None:
             scene.hold(start.held, start.held_xyz, start.opening_m)
@@ -176,6 +179,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
             opengl_vendor=self._renderer and self._renderer.opengl_vendor,
             opengl_renderer=self._renderer and self._renderer.opengl_renderer,
             task_version=find_suite(episode.spec.suite).version,
+            sapien_version=installed_version("sapien") if episode.spec.simulator == "sapien" else None,
         )
 
     def close(self) -> None:

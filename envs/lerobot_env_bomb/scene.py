@@ -17,7 +17,8 @@ from lerobot_env_bomb.model import (
     show_pattern,
     stone_name,
 )
-from lerobot_env_bomb.robots import ROBOTS
+from lerobot_env_bomb.physics import MujocoPhysics, Physics
+from lerobot_env_bomb.robots import PAD_SIDES, ROBOTS, Robot
 from lerobot_env_mujoco.mujoco_gl import mujoco
 
 WORKSPACE_LOW = np.array(WORKSPACE_LOW_M)
@@ -37,10 +38,27 @@ EDITABLE = (
 )
 
 
+def physics_of(simulator: str) -> "Callable[[Robot, mujoco.MjModel, mujoco.MjData], Physics]":
+    """Return the class of a simulator; SAPIEN is imported only where it is used.
+
+    Raises:
+        ValueError: SAPIEN cannot be imported.
+    """
+    if simulator == "mujoco":
+        return MujocoPhysics
+    try:
+        from lerobot_env_bomb.sapien_physics import SapienPhysics
+    except ImportError as error:
+        raise ValueError(
+            f"--env.simulator=sapien: SAPIEN cannot be imported ({error}); on Debian it needs libx11-6"
+        ) from error
+    return SapienPhysics
+
+
 class Scene:
     """One compiled model and its state."""
 
-    def __init__(self, robot: str = "scara"):
+    def __init__(self, robot: str = "scara", simulator: str = "mujoco"):
         self.robot = ROBOTS[robot]
         self.model = compile_scene(self.robot)
         self.data = mujoco.MjData(self.model)
@@ -52,14 +70,12 @@ class Scene:
         self._contype, self._conaffinity = self.model.geom_contype.copy(), self.model.geom_conaffinity.copy()
         self._stone_visuals = np.array([self.model.geom(f"{name}_visual").id for name in names])
         self._stone_qpos = np.array([self.model.joint(name).qposadr[0] for name in names])
-        self._pads = [self.model.geom(f"{side}_pad").id for side in ("left", "right")]
-        self._fingers = np.array(
-            [self.model.joint(f"{side}_finger").qposadr[0] for side in ("left", "right")]
-        )
+        self._fingers = np.array([self.model.joint(f"{side}_finger").qposadr[0] for side in PAD_SIDES])
         self._grip = self.model.site("grip").id
         headlight = self.model.vis.headlight
         arrays = [getattr(self.model, name) for name in EDITABLE] + [headlight.ambient, headlight.diffuse]
         self._nominal = [(array, array.copy()) for array in arrays]
+        self._physics = physics_of(simulator)(self.robot, self.model, self.data)
 
     def reset(
         self,
@@ -88,6 +104,7 @@ class Scene:
         self.data.ctrl[:] = self.robot.max_half_opening_m
         self.data.mocap_pos[0] = layout.gripper_xyz
         mujoco.mj_forward(self.model, self.data)
+        self._physics.begin()
 
     def hold(self, stone: int, stone_xyz: np.ndarray, opening_m: float) -> None:
         """Put a stone with its centre at (3,) metres between pads that are ``opening_m`` apart."""
@@ -100,29 +117,21 @@ class Scene:
         """Move the gripper towards (3,) metres, clipped to the workspace, and open or close it."""
         start = self.data.mocap_pos[0].copy()
         target = np.clip(target_xyz, WORKSPACE_LOW, WORKSPACE_HIGH)
-        self.data.ctrl[:] = self.robot.max_half_opening_m if open_fingers else 0.0
+        opening_m = self.robot.max_half_opening_m if open_fingers else 0.0
         num_travel = max(1, round(TRAVEL_SHARE * num_substeps))
         for substep in range(num_substeps):
             share = min(1.0, (substep + 1) / num_travel)
             # smoothstep: no jerk that would shake a held stone
-            self.data.mocap_pos[0] = start + (3 * share**2 - 2 * share**3) * (target - start)
-            mujoco.mj_step(self.model, self.data)
-        # poses and contacts of the state that the last substep ended in
-        mujoco.mj_forward(self.model, self.data)
+            self._physics.step(start + (3 * share**2 - 2 * share**3) * (target - start), opening_m)
+        self._physics.finish()
 
     def measure(self) -> SceneState:
         """Return the current poses and contacts."""
-        touched = np.zeros((NUM_STONES, 2), dtype=bool)
-        stone_of_geom = {geom: i for i, geom in enumerate(self._stone_rims)}
-        for geom1, geom2 in self.data.contact.geom:
-            for pad, geom in ((geom1, geom2), (geom2, geom1)):
-                if pad in self._pads and geom in stone_of_geom:
-                    touched[stone_of_geom[geom], self._pads.index(pad)] = True
         return SceneState(
             gripper_xyz=self.data.site_xpos[self._grip].copy(),
             finger_opening=float(self.data.qpos[self._fingers].sum()),
             stone_xyz=self.data.xpos[self._stone_bodies].copy(),
-            stone_touched=touched,
+            stone_touched=self._physics.touched(),
         )
 
     def _show_stones(self, layout: Layout) -> None:

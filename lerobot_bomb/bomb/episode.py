@@ -15,6 +15,7 @@ from lerobot_bomb.flags import one_of
 PROTOCOL_VERSION = "1.1"
 
 ROBOTS = ("scara", "fetch")
+SIMULATORS = ("mujoco", "sapien")  # of the physics; MuJoCo draws
 CONTROL_MODES = ("relative", "absolute")
 SPLITS = ("all", "train", "heldout")
 
@@ -72,11 +73,13 @@ class EpisodeSpec(PerturbedSpec):
     task_id: int | None = None
     success_tolerance_mm: float = 10.0  # distance from the target within which a placement counts
     perturbations: str = NONE  # condition, such as camera:2+light:3; a range may be in it
+    simulator: str = "mujoco"  # --env.simulator
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "perturbations", Condition(self.perturbations))
         one_of("--env.task", self.suite, SUITES)
         one_of("--env.robot", self.robot, ROBOTS)
+        one_of("--env.simulator", self.simulator, SIMULATORS)
         one_of("--env.split", self.split, SPLITS)
         one_of("--env.control_mode", self.control_mode, CONTROL_MODES)
         check_seed(self.seed)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_bomb.bomb.board import BOARD, COLORS
-from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS, ROBOTS, SPLITS, EpisodeSpec
+from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS, ROBOTS, SIMULATORS, SPLITS, EpisodeSpec
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RENDER_PRESETS
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
@@ -18,7 +18,18 @@ from lerobot_bomb.conditions import NONE
 LONG_FORMS = {
     f"--{name}": f"--env.{name}"
     for name in (
-        *("task", "robot", "control_mode", "fps", "image_size", "render_preset", "depth", "split", "target"),
+        *(
+            "task",
+            "robot",
+            "simulator",
+            "control_mode",
+            "fps",
+            "image_size",
+            "render_preset",
+            "depth",
+            "split",
+            "target",
+        ),
         *("color", "task_ids", "perturbations", "success_tolerance_mm", "instruction", "max_steps"),
         "ignore_checkpoint",
     )
@@ -166,6 +177,7 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
     tolerance = EpisodeSpec.success_tolerance_mm
     add("task", default="place", help=f"suite: {', '.join(SUITES)} (default: place)")
     add("robot", default="scara", help=f"{', '.join(ROBOTS)} (default: scara)")
+    add("simulator", default="mujoco", help=f"of the physics: {' or '.join(SIMULATORS)} (default: mujoco)")
     add("control_mode", default="relative", help=f"{' or '.join(CONTROL_MODES)} (default: relative)")
     add("fps", type=int, default=DEFAULT_FPS, help=f"control steps a second (default: {DEFAULT_FPS})")
     add(

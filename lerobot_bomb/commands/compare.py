@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO, add_names_flag, parse_conditions, path_flag
 from lerobot_bomb.commands.results_files import check_outputs, names_of, policy_keys, read_undamaged
 from lerobot_bomb.files import written_whole
+from lerobot_bomb.flags import one_of
 from lerobot_bomb.report.latex import comparison_table
 from lerobot_bomb.results.comparison import compare
 from lerobot_bomb.results.groups import policy_key
@@ -22,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output = "also write the comparison as a LaTeX table to this file, .tex"
     add("--output", type=path_flag, metavar="FILE.tex", help=output)
     add_names_flag(parser)
+    add("--across", metavar="FIELD", help="compare one policy of A across: simulator")
     add("--policies", type=parse_conditions, default=(), metavar="A,B", help=two)
     unless = (
         f"exit code {ANSWER_IS_NO} unless, under every condition and with 95 %% confidence, B's success is"
@@ -56,6 +58,24 @@ def _two_policies(args: argparse.Namespace) -> tuple[list[Record], list[Record]]
     return both[0], both[1]
 
 
+def _two_values(args: argparse.Namespace) -> tuple[list[Record], list[Record]]:
+    """Return the records of A with either value of the field --across."""
+    if args.b is not None:
+        raise ValueError("--across compares records of one file; leave B out")
+    records = [each for part in _by_policy(read_undamaged(args.a).records, args.policies) for each in part]
+    one_of("--across", args.across, tuple({name: None for each in records for name in each.comparable}))
+    by_value: dict[str, list[Record]] = {}
+    for record in records:
+        by_value.setdefault(getattr(record.spec, args.across), []).append(record)
+    if len(by_value) != 2:
+        raise ValueError(
+            f"{args.a}: --across={args.across} compares two of its values, not {len(by_value)} "
+            f"({', '.join(by_value)}); evaluate with another --env.{args.across}, into the same file"
+        )
+    first, second = by_value.values()
+    return first, second
+
+
 def _by_policy(records: list[Record], names: Sequence[str]) -> list[list[Record]]:
     """Split records by policy: those that are named, or all in order of first appearance."""
     by_key: dict[str, list[Record]] = {}
@@ -75,8 +95,9 @@ def run(args: argparse.Namespace) -> int:
     """Print both rates and their difference, by condition; check the required difference."""
     if args.output is not None and args.output.suffix != ".tex":
         raise ValueError(f"--output={args.output} must be a file of LaTeX, .tex")
-    policies = _two_policies(args)
-    comparisons = compare(*policies, names_of(args.names, [*policies[0], *policies[1]]))
+    sides = _two_policies(args) if args.across is None else _two_values(args)
+    names = names_of(args.names, [*sides[0], *sides[1]])
+    comparisons = compare(*sides, names, args.across)
     print_lines(*comparisons.lines())
     if args.output is not None:
         _write(args, comparison_table(comparisons))

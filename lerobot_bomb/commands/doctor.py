@@ -16,6 +16,7 @@ from types import ModuleType
 from packaging.requirements import Requirement
 
 import lerobot_bomb
+from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.environments import ENVIRONMENTS
 from lerobot_bomb.libero.assets import INSTALL, SUITES, Libero, describe_missing_assets
 
@@ -107,6 +108,18 @@ def check_fetch() -> Iterator[Component]:
         yield Component("--env.robot=fetch", str(error), absent=True)
 
 
+def check_sapien() -> Iterator[Component]:
+    """Check that the second simulator is installed."""
+    try:
+        importlib.import_module("lerobot_env_bomb.simulators").check_simulator(
+            EpisodeSpec(0, simulator="sapien")
+        )
+        importlib.import_module("lerobot_env_bomb.scene").physics_of("sapien")
+        yield Component("--env.simulator=sapien", "can run")
+    except ValueError as error:
+        yield Component("--env.simulator=sapien", str(error), absent=True)
+
+
 def check_libero() -> Iterator[Component]:
     """Check that LIBERO is installed and has a config file and assets; nothing else needs it."""
     libero = Libero.find()
@@ -177,6 +190,7 @@ CHECKS: tuple[Callable[[], Iterator[Component]], ...] = (
     check_versions,
     check_rendering,
     check_fetch,
+    check_sapien,
     check_libero,
     check_types,
     check_gpu,

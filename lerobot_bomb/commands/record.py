@@ -252,7 +252,17 @@ def _behavior_policy(recording: Recording, policy_path: Path) -> BehaviorPolicy:
     from lerobot_bomb.checkpoints.acting import OVERRIDE  # LeRobot and torch: seconds
     from lerobot_bomb.viewing.checkpoint import load_policy
 
-    names = ("task", "robot", "control_mode", "fps", "image_size", "render_preset", "depth", "split")
+    names = (
+        "task",
+        "robot",
+        "simulator",
+        "control_mode",
+        "fps",
+        "image_size",
+        "render_preset",
+        "depth",
+        "split",
+    )
     env_flags = {name: getattr(recording, name) for name in names}
     with rewording_errors({"evaluate with": "record with", OVERRIDE: "train one for this"}):
         loaded = load_policy(policy_path, None, "bomb", env_flags, recording.seed)

@@ -29,6 +29,7 @@ class Recording(BaseRecording):
 
     task: str = "place"
     robot: str = "scara"
+    simulator: str = "mujoco"
     control_mode: str = "relative"
     fps: int = DEFAULT_FPS
     image_size: int = DEFAULT_IMAGE_SIZE
@@ -55,6 +56,8 @@ class Recording(BaseRecording):
     package_version: str = __version__
     # another one gives other bits
     mujoco_version: str | None = field(default_factory=partial(installed_version, "mujoco"))
+    # None where MuJoCo is the simulator
+    sapien_version: str | None = None
 
     def __post_init__(self) -> None:
         if self.static:
@@ -65,6 +68,8 @@ class Recording(BaseRecording):
             raise ValueError(
                 f"--env.task_ids={list(self.task_ids)} are numbers in a suite; --env.task={ALL} is of all"
             )
+        if self.simulator == "sapien":
+            object.__setattr__(self, "sapien_version", installed_version("sapien"))
         if not self.protocol_version:
             object.__setattr__(self, "protocol_version", task_version(self.task))
         with self.flag_names():
@@ -76,6 +81,10 @@ class Recording(BaseRecording):
         """Set the number of episodes from that of scenes, which are always labelled."""
         if self.static < 1 or self.static % self.scenes:
             raise ValueError(f"--static={self.static} must be in 1..{SCENES} or a multiple of {SCENES}")
+        if self.simulator != "mujoco":
+            raise ValueError(
+                f"--env.simulator={self.simulator}: nothing moves in static scenes; leave it out"
+            )
         for name, value in {"--relabel": self.relabel, f"--noise={self.noise}": self.noise}.items():
             if value:
                 raise ValueError(f"{name}: static scenes are no episodes; leave it out with --static")
@@ -97,6 +106,7 @@ class Recording(BaseRecording):
             seed=self.seed,
             suite=suite,
             robot=self.robot,
+            simulator=self.simulator,
             split=self.split,
             control_mode=self.control_mode,
             fps=self.fps,

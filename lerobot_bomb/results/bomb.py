@@ -101,8 +101,11 @@ class EpisodeResult(Record):
         "task_id": None,
         "progress": None,
         "spec.task_id": None,
+        "spec.simulator": "mujoco",
+        "sapien_version": None,
     }
     drawn: ClassVar = ("target", "color", "task_id")
+    comparable: ClassVar = {"simulator": ("SAPIEN",)}
     tasks: ClassVar = (*SUITES, ALL)
     measures: ClassVar = (
         Measure("moves made", _progress, "mean share of an episode's moves"),
@@ -141,6 +144,8 @@ class EpisodeResult(Record):
     machine: str = field(default_factory=machine_name)
     # installed MuJoCo
     mujoco_version: str | None = field(default_factory=partial(installed_version, "mujoco"))
+    # installed SAPIEN; null: MuJoCo is the simulator
+    sapien_version: str | None = None
     lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
     torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
     package_version: str = __version__
@@ -156,6 +161,7 @@ class EpisodeResult(Record):
             if asked not in (None, value):
                 shown = [list(each) if isinstance(each, tuple) else each for each in (value, asked)]
                 raise ValueError(f"{name}={shown[0]}, but spec.{name}={shown[1]}")
+        self.refuse_if((spec.simulator == "sapien") != (self.sapien_version is not None), "sapien_version")
         self._check_stage()
         self._check_place()
         self._check_tasks()
@@ -206,6 +212,7 @@ class EpisodeResult(Record):
         opengl = [name for name in (self.opengl_vendor, self.opengl_renderer) if name]
         return {
             "MuJoCo": self.mujoco_version or NOT_RECORDED,
+            **({"SAPIEN": self.sapien_version} if self.sapien_version else {}),
             "OpenGL": ", ".join(opengl) or NOT_RECORDED,
             "render_preset": self.render_preset,
             "tasks": self._tasks_key(),
@@ -223,7 +230,8 @@ class EpisodeResult(Record):
     @classmethod
     def describe_simulator(cls, settings: Mapping[str, str]) -> str:
         drawn = f"render_preset {settings['render_preset']}, OpenGL {settings['OpenGL']}"
-        return f"{drawn}, MuJoCo {settings['MuJoCo']}"
+        physics = f", physics by SAPIEN {settings['SAPIEN']}" if "SAPIEN" in settings else ""
+        return f"{drawn}, MuJoCo {settings['MuJoCo']}{physics}"
 
     @classmethod
     def describe_tasks(cls, records: Sequence[Self]) -> str:

@@ -1,6 +1,6 @@
 """Comparison of two policies on the same episodes: which is better, by how much, and is it certain?"""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -93,29 +93,42 @@ def _lines(compared: PairedComparison) -> list[str]:
     ]
 
 
-def can_compare(first: Group, second: Group) -> bool:
-    """Return True if two groups differ in nothing but their policies, as far as their records say."""
-    return not _apart(_values_of([first]), _values_of([second]))
+def can_compare(first: Group, second: Group, across: Collection[str] = ()) -> bool:
+    """Return True if two groups differ in nothing but policy and these settings, as far as records say."""
+    return not _apart(_values_of([first]), _values_of([second]), across)
 
 
 def compare(
-    first: Sequence[Record], second: Sequence[Record], names: Mapping[str, str] | None = None
+    first: Sequence[Record],
+    second: Sequence[Record],
+    names: Mapping[str, str] | None = None,
+    across: str | None = None,
 ) -> Comparisons:
-    """Pair the episodes of two policies; `names`: {key of a policy: its name}.
+    """Pair the episodes of two policies, or of one policy across a field of the spec.
+
+    Args:
+        first: records of one side.
+        second: records of the other.
+        names: {key of a policy: its name}.
+        across: field in which the sides differ, one of the records' `comparable`.
 
     Raises:
         ValueError: one side has several policies, or there is no pair; names what differs.
     """
     groups = groups_of(first), groups_of(second)
     policies = _only_policy("the first", groups[0]), _only_policy("the second", groups[1])
-    pairs = list(_pairs(*groups))
+    pairs = list(_pairs(*groups, across))
     if not pairs:
-        raise ValueError(f"no episode is in both: {_why_none(*groups)}")
+        raise ValueError(f"no episode is in both: {_why_none(*groups, across)}")
     num_first, num_second = (sum(len(group.records) for group in policy_groups) for policy_groups in groups)
     chosen = names or {}
     keys = [policy_groups[0].settings[POLICY] for policy_groups in groups]
     given = {place: chosen[key] for place, key in enumerate(keys) if key in chosen}
     first_name, second_name = policy_names([each[0].records[0].policy for each in groups], given)
+    if across is not None:
+        first_name = second_name = policy_names([groups[0][0].records[0].policy], given)[0]
+        values = [getattr(each[0].records[0].spec, across) for each in groups]
+        first_name, second_name = (f"{first_name}, {across} {value}" for value in values)
     return Comparisons(
         policies=policies,
         names=(first_name, second_name),
@@ -152,19 +165,30 @@ def _only_policy(name: str, groups: list[Group]) -> str:
     return groups[0].records[0].describe_policy()
 
 
-def _pairs(first: list[Group], second: list[Group]) -> Iterator[tuple[Group, Pair]]:
+def _pairs(first: list[Group], second: list[Group], across: str | None) -> Iterator[tuple[Group, Pair]]:
     """Yield each pair with the group of its first record."""
+    settings = _settings_across(first, across)
     candidates: dict[Any, list[tuple[int, Record]]] = {}
     for place, group in enumerate(second):
         for record in group.records:
-            candidates.setdefault(record.spec, []).append((place, record))
+            candidates.setdefault(_episode(record, across), []).append((place, record))
     for group in first:
-        can_pair = [can_compare(group, other) for other in second]
+        can_pair = [can_compare(group, other, settings) for other in second]
         for record in group.records:
-            of_episode = candidates.get(record.spec, [])
+            of_episode = candidates.get(_episode(record, across), [])
             places = [place for place, (number, _) in enumerate(of_episode) if can_pair[number]]
             if places:
                 yield group, (record, of_episode.pop(places[0])[1])
+
+
+def _episode(record: Record, across: str | None) -> tuple[Any, ...]:
+    """Return a key that is equal for records of one episode on both sides."""
+    return tuple([value for name, value in vars(record.spec).items() if name != across])
+
+
+def _settings_across(groups: list[Group], across: str | None) -> tuple[str, ...]:
+    """Return the settings that differ where this field does."""
+    return () if across is None else (across, *groups[0].record_type.comparable[across])
 
 
 def _values_of(groups: list[Group]) -> Values:
@@ -173,7 +197,7 @@ def _values_of(groups: list[Group]) -> Values:
     return {name: {group.settings.get(name, NOT_RECORDED) for group in groups} for name in names}
 
 
-def _apart(first: Values, second: Values) -> list[str]:
+def _apart(first: Values, second: Values, across: Collection[str] = ()) -> list[str]:
     """Return the settings in which the two have no value in common.
 
     A setting that was not recorded keeps no episodes apart: an expert is shown no image, so OpenGL drew none.
@@ -181,13 +205,13 @@ def _apart(first: Values, second: Values) -> list[str]:
     return [
         name
         for name, values in first.items()
-        if name != POLICY
+        if name not in (POLICY, *across)
         and not values & second.get(name, set())
         and NOT_RECORDED not in values | second.get(name, set())
     ]
 
 
-def _why_none(first: list[Group], second: list[Group]) -> str:
-    if apart := _apart(_values_of(first), _values_of(second)):
+def _why_none(first: list[Group], second: list[Group], across: str | None) -> str:
+    if apart := _apart(_values_of(first), _values_of(second), _settings_across(first, across)):
         return f"they differ in {', '.join(apart)}"
     return "seeds, conditions or tasks have nothing in common; evaluate both with the same --seed and flags"

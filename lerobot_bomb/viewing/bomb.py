@@ -29,7 +29,7 @@ from lerobot_bomb.viewing.sheet import FONT_SIZE, GAP, INK, TILE_PAPER, font, te
 if TYPE_CHECKING:
     from lerobot_bomb.viewing.film import Shot
 
-SPEC_FLAGS = ("robot", "split", "control_mode", "fps", "target", "color", "success_tolerance_mm")
+SPEC_FLAGS = ("robot", "simulator", "split", "control_mode", "fps", "target", "color", "success_tolerance_mm")
 GRID_RGB, NOMINAL_RGB, PATH_RGB = (200, 185, 160), (165, 165, 165), (210, 40, 30)
 
 
