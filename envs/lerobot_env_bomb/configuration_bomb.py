@@ -66,7 +66,7 @@ class BombEnvConfig(EvaluatedEnv, EnvConfig):
         for spec in (spec for specs in self.groups.values() for spec in specs.values()):
             find_suite(spec.suite).check(spec)
             check_robot(spec)
-            check_simulator(spec)
+            check_simulator(spec.simulator)
         geometry_shapes(self.render_options)
 
     def take_image_size(self, config: PreTrainedConfig | None) -> None:

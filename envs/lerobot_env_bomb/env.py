@@ -22,7 +22,7 @@ from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
 from lerobot_bomb.results.bomb import EpisodeResult
-from lerobot_bomb.results.origin import PolicyIdentity, installed_version
+from lerobot_bomb.results.origin import PolicyIdentity, sapien_version
 from lerobot_env_bomb.actuator import Actuator
 from lerobot_env_bomb.alternatives import alternatives
 from lerobot_env_bomb.axes.dynamics import Dynamics
@@ -83,7 +83,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         suite = find_suite(spec.suite)
         suite.check(spec)
         check_robot(spec)
-        check_simulator(spec)
+        check_simulator(spec.simulator)
         super().__init__(spec, spec.suite, results_path, render_mode)
         self._num_substeps = PHYSICS_HZ // spec.fps
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": spec.fps}
@@ -179,7 +179,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
             opengl_vendor=self._renderer and self._renderer.opengl_vendor,
             opengl_renderer=self._renderer and self._renderer.opengl_renderer,
             task_version=find_suite(episode.spec.suite).version,
-            sapien_version=installed_version("sapien") if episode.spec.simulator == "sapien" else None,
+            sapien_version=sapien_version(episode.spec.simulator),
         )
 
     def close(self) -> None:

@@ -5,7 +5,8 @@ The description of the scene is MuJoCo's model for every simulator: axes edit it
 other than MuJoCo reads bodies, masses and frictions from the edited model, and writes its states back.
 """
 
-from typing import Protocol
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -35,6 +36,24 @@ class Physics(Protocol):
         ...
 
 
+def touched_stones(
+    contacts: Iterable[Sequence[Any]], pads: Sequence[Any], number_of: Mapping[Any, int]
+) -> np.ndarray:
+    """(NUM_STONES, 2) bool: stones that the pads touch.
+
+    Args:
+        contacts: two bodies each, in any order.
+        pads: the left and the right one.
+        number_of: {body of a stone: its number}.
+    """
+    touched = np.zeros((NUM_STONES, 2), dtype=bool)
+    for body1, body2 in contacts:
+        for pad, stone in ((body1, body2), (body2, body1)):
+            if pad in pads and stone in number_of:
+                touched[number_of[stone], pads.index(pad)] = True
+    return touched
+
+
 class MujocoPhysics:
     """MuJoCo: a weld draws the gripper to a mocap body."""
 
@@ -56,9 +75,4 @@ class MujocoPhysics:
         mujoco.mj_forward(self._model, self._data)
 
     def touched(self) -> np.ndarray:
-        touched = np.zeros((NUM_STONES, 2), dtype=bool)
-        for geom1, geom2 in self._data.contact.geom:
-            for pad, geom in ((geom1, geom2), (geom2, geom1)):
-                if pad in self._pads and geom in self._stone_of_geom:
-                    touched[self._stone_of_geom[geom], self._pads.index(pad)] = True
-        return touched
+        return touched_stones(self._data.contact.geom, self._pads, self._stone_of_geom)

@@ -12,8 +12,8 @@ from lerobot_env_mujoco.mujoco_gl import mujoco
 
 SCARA_XML = Path(__file__).with_name("scara.xml")
 BASE_XY = np.array([0.0, 0.30])  # metres, SCARA's shoulder; as in scara.xml
-PAD_SIDES = ("left", "right")
 LINK_M = 0.27  # length of either of SCARA's links; as in scara.xml
+PAD_SIDES = ("left", "right")
 
 
 @dataclass(frozen=True)

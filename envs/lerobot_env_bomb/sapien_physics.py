@@ -18,6 +18,7 @@ import numpy as np
 from lerobot_bomb.bomb.board import NUM_STONES
 from lerobot_bomb.bomb.episode import PHYSICS_HZ
 from lerobot_env_bomb.model import stone_name
+from lerobot_env_bomb.physics import touched_stones
 from lerobot_env_bomb.robots import PAD_SIDES, Robot
 from lerobot_env_mujoco.mujoco_gl import mujoco
 
@@ -32,12 +33,9 @@ CONTACT_OFFSET_M = 0.002
 POSITION_ITERATIONS, VELOCITY_ITERATIONS = 25, 2
 HAND_MASS_KG = 0.5
 HAND_RAD_S = 125.0  # frequency of the drive to the command: the weld's solref of 0.01 s and 0.8
-X_TO_Z = (np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0)  # SAPIEN's cylinders lie along x
-AXIS_TURNS = (
-    (1.0, 0.0, 0.0, 0.0),
-    (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)),
-    (np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0),
-)
+# SAPIEN's cylinders lie along x, and its slides go along it
+X_TO_X, X_TO_Y = (1.0, 0.0, 0.0, 0.0), (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
+X_TO_Z, X_TO_MINUS_X = (np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0), (0.0, 0.0, 0.0, 1.0)
 PAD_GROUPS = [1, 1, 2, 0]  # the third number: pads do not touch each other
 
 
@@ -46,7 +44,6 @@ class SapienPhysics:
 
     def __init__(self, robot: Robot, model: mujoco.MjModel, data: mujoco.MjData):
         self._robot, self._model, self._data = robot, model, data
-        self._stones: dict[int, Any] = {}
 
     def begin(self) -> None:
         physx.set_scene_config(enable_enhanced_determinism=True)
@@ -61,7 +58,7 @@ class SapienPhysics:
         for name in SUPPORTS:
             self._add_support(name)
         in_play = [i for i in range(NUM_STONES) if self._model.geom(stone_name(i)).contype[0]]
-        self._stones = {i: self._add_stone(i) for i in in_play}
+        self._stones: dict[int, Any] = {i: self._add_stone(i) for i in in_play}
         self._add_hand()
 
     def _add_support(self, name: str) -> None:
@@ -92,14 +89,14 @@ class SapienPhysics:
         builder = self._scene.create_articulation_builder()
         link = builder.create_link_builder()
         link.set_mass_and_inertia(1.0, Pose(), [1.0, 1.0, 1.0])
-        for axis, turn in zip("xyz", AXIS_TURNS, strict=True):
+        for axis, turn in zip("xyz", (X_TO_X, X_TO_Y, X_TO_Z), strict=True):
             link = self._add_slide(builder, link, axis, Pose(q=turn), (-np.inf, np.inf), HAND_MASS_KG)
         grip = self._data.site("grip").xpos
         for side in PAD_SIDES:
             joint, pad = self._model.joint(f"{side}_finger"), self._model.geom(f"{side}_pad")
             along = self._data.xaxis[joint.id]
             mass = float(self._model.body_mass[self._model.jnt_bodyid[joint.id]])
-            turn = Pose(q=(1, 0, 0, 0) if along[0] > 0 else (0, 0, 0, 1))
+            turn = Pose(q=X_TO_X if along[0] > 0 else X_TO_MINUS_X)
             finger = self._add_slide(builder, link, f"{side}_finger", turn, tuple(joint.range), mass)
             opening = self._data.joint(f"{side}_finger").qpos[0]
             center = self._data.geom_xpos[pad.id] - grip - opening * along
@@ -126,7 +123,6 @@ class SapienPhysics:
                 shape.set_collision_groups(PAD_GROUPS)
         openings = [self._data.joint(finger.name).qpos[0] for finger in self._fingers]
         self._hand.qpos = np.array([*grip, *openings], dtype=np.float32)
-        self._command_xyz = grip.copy()
 
     @staticmethod
     def _add_slide(builder: Any, parent: Any, name: str, along: Pose, limits: tuple, mass: float) -> Any:
@@ -138,13 +134,13 @@ class SapienPhysics:
         return link
 
     def step(self, command_xyz: np.ndarray, opening_m: float) -> None:
-        velocity = (command_xyz - self._command_xyz) * PHYSICS_HZ
+        velocity = (command_xyz - self._data.mocap_pos[0]) * PHYSICS_HZ
         for drive, position, speed in zip(self._drives, command_xyz, velocity, strict=True):
             drive.set_drive_target(float(position))
             drive.set_drive_velocity_target(float(speed))
         for finger in self._fingers:
             finger.set_drive_target(opening_m)
-        self._command_xyz = command_xyz.copy()
+        self._data.mocap_pos[0] = command_xyz
         self._system.step()
 
     def finish(self) -> None:
@@ -155,18 +151,13 @@ class SapienPhysics:
         for index, stone in self._stones.items():
             pose = stone.entity.pose
             self._data.joint(stone_name(index)).qpos = [*pose.p, *pose.q]
-        self._data.mocap_pos[0] = self._command_xyz
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
 
     def touched(self) -> np.ndarray:
-        touched = np.zeros((NUM_STONES, 2), dtype=bool)
-        stones = list(self._stones.values())
-        numbers = list(self._stones)
-        for contact in self._system.get_contacts():
-            if not any(np.any(point.impulse) for point in contact.points):
-                continue
-            for pad, stone in (contact.bodies, contact.bodies[::-1]):
-                if pad in self._pads and stone in stones:
-                    touched[numbers[stones.index(stone)], self._pads.index(pad)] = True
-        return touched
+        pressed = (
+            contact.bodies
+            for contact in self._system.get_contacts()
+            if any(np.any(point.impulse) for point in contact.points)
+        )
+        return touched_stones(pressed, self._pads, {stone: index for index, stone in self._stones.items()})

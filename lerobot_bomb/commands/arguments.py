@@ -14,23 +14,17 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.conditions import NONE
 
+# flags of `bomb` that hold for all tasks and conditions of an evaluation
+SETTINGS = (
+    *("task", "robot", "simulator", "control_mode", "fps"),
+    *("image_size", "render_preset", "depth", "split"),
+)
 # short form of a flag of the environment -> the flag as LeRobot spells it
 LONG_FORMS = {
     f"--{name}": f"--env.{name}"
     for name in (
-        *(
-            "task",
-            "robot",
-            "simulator",
-            "control_mode",
-            "fps",
-            "image_size",
-            "render_preset",
-            "depth",
-            "split",
-            "target",
-        ),
-        *("color", "task_ids", "perturbations", "success_tolerance_mm", "instruction", "max_steps"),
+        *SETTINGS,
+        *("target", "color", "task_ids", "perturbations", "success_tolerance_mm", "instruction", "max_steps"),
         "ignore_checkpoint",
     )
 }

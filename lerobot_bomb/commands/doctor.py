@@ -16,7 +16,6 @@ from types import ModuleType
 from packaging.requirements import Requirement
 
 import lerobot_bomb
-from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.environments import ENVIRONMENTS
 from lerobot_bomb.libero.assets import INSTALL, SUITES, Libero, describe_missing_assets
 
@@ -111,9 +110,7 @@ def check_fetch() -> Iterator[Component]:
 def check_sapien() -> Iterator[Component]:
     """Check that the second simulator is installed."""
     try:
-        importlib.import_module("lerobot_env_bomb.simulators").check_simulator(
-            EpisodeSpec(0, simulator="sapien")
-        )
+        importlib.import_module("lerobot_env_bomb.simulators").check_simulator("sapien")
         importlib.import_module("lerobot_env_bomb.scene").physics_of("sapien")
         yield Component("--env.simulator=sapien", "can run")
     except ValueError as error:

@@ -14,6 +14,7 @@ from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE
 from lerobot_bomb.checkpoints.names import WEIGHTS
 from lerobot_bomb.checkpoints.training import trained_image_size
 from lerobot_bomb.commands.arguments import (
+    SETTINGS,
     add_episode_arguments,
     add_new_dataset_arguments,
     checkpoint_flag,
@@ -252,18 +253,7 @@ def _behavior_policy(recording: Recording, policy_path: Path) -> BehaviorPolicy:
     from lerobot_bomb.checkpoints.acting import OVERRIDE  # LeRobot and torch: seconds
     from lerobot_bomb.viewing.checkpoint import load_policy
 
-    names = (
-        "task",
-        "robot",
-        "simulator",
-        "control_mode",
-        "fps",
-        "image_size",
-        "render_preset",
-        "depth",
-        "split",
-    )
-    env_flags = {name: getattr(recording, name) for name in names}
+    env_flags = {name: getattr(recording, name) for name in SETTINGS}
     with rewording_errors({"evaluate with": "record with", OVERRIDE: "train one for this"}):
         loaded = load_policy(policy_path, None, "bomb", env_flags, recording.seed)
 

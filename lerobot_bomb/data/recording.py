@@ -15,7 +15,7 @@ from lerobot_bomb.data.base_recording import BaseRecording
 from lerobot_bomb.data.rollout_pool import RolloutSettings
 from lerobot_bomb.envs.rollout import Expert
 from lerobot_bomb.flags import one_of, rewording_errors
-from lerobot_bomb.results.origin import installed_version
+from lerobot_bomb.results.origin import installed_version, sapien_version
 
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout
@@ -56,7 +56,7 @@ class Recording(BaseRecording):
     package_version: str = __version__
     # another one gives other bits
     mujoco_version: str | None = field(default_factory=partial(installed_version, "mujoco"))
-    # None where MuJoCo is the simulator
+    # None where MuJoCo is the simulator; filled in
     sapien_version: str | None = None
 
     def __post_init__(self) -> None:
@@ -68,8 +68,7 @@ class Recording(BaseRecording):
             raise ValueError(
                 f"--env.task_ids={list(self.task_ids)} are numbers in a suite; --env.task={ALL} is of all"
             )
-        if self.simulator == "sapien":
-            object.__setattr__(self, "sapien_version", installed_version("sapien"))
+        object.__setattr__(self, "sapien_version", sapien_version(self.simulator))
         if not self.protocol_version:
             object.__setattr__(self, "protocol_version", task_version(self.task))
         with self.flag_names():

@@ -13,7 +13,7 @@ class ExactStats(RunningQuantileStats):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._counts_CV = np.zeros((0, 256), dtype=np.int64)  # how often each channel has each value
+        self._counts_CV: np.ndarray | None = None  # how often each channel has each value
         self._batches: list[np.ndarray] = []
 
     def update(self, batch: np.ndarray) -> None:
@@ -21,17 +21,15 @@ class ExactStats(RunningQuantileStats):
         batch_ND = batch.reshape(-1, batch.shape[-1])
         if batch.dtype == np.uint8:
             counts_CV = np.stack([np.bincount(values_N, minlength=256) for values_N in batch_ND.T])
-            self._counts_CV = counts_CV + (self._counts_CV if len(self._counts_CV) else 0)
+            self._counts_CV = counts_CV if self._counts_CV is None else self._counts_CV + counts_CV
         else:
             self._batches.append(batch_ND)
 
     def get_statistics(self) -> Statistics:
         """Return (D,) min, max, mean, std and quantiles, and (1,) count."""
-        return (
-            counted_statistics(self._counts_CV)
-            if len(self._counts_CV)
-            else exact_statistics(np.concatenate(self._batches))
-        )
+        if self._counts_CV is not None:
+            return counted_statistics(self._counts_CV)
+        return exact_statistics(np.concatenate(self._batches))
 
 
 def counted_statistics(counts_CV: np.ndarray) -> Statistics:

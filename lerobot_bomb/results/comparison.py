@@ -6,7 +6,7 @@ from typing import Any
 
 from lerobot_bomb.results.groups import POLICY, Group, groups_of, rate_of
 from lerobot_bomb.results.names import policy_names
-from lerobot_bomb.results.pairs import Pair, PairedComparison, compare_pairs, describe_test
+from lerobot_bomb.results.pairs import Pair, PairedComparison, compare_pairs, describe_test, episode_key
 from lerobot_bomb.results.record import NOT_RECORDED, Record
 from lerobot_bomb.stats import format_p
 
@@ -171,19 +171,14 @@ def _pairs(first: list[Group], second: list[Group], across: str | None) -> Itera
     candidates: dict[Any, list[tuple[int, Record]]] = {}
     for place, group in enumerate(second):
         for record in group.records:
-            candidates.setdefault(_episode(record, across), []).append((place, record))
+            candidates.setdefault(episode_key(record, across), []).append((place, record))
     for group in first:
         can_pair = [can_compare(group, other, settings) for other in second]
         for record in group.records:
-            of_episode = candidates.get(_episode(record, across), [])
+            of_episode = candidates.get(episode_key(record, across), [])
             places = [place for place, (number, _) in enumerate(of_episode) if can_pair[number]]
             if places:
                 yield group, (record, of_episode.pop(places[0])[1])
-
-
-def _episode(record: Record, across: str | None) -> tuple[Any, ...]:
-    """Return a key that is equal for records of one episode on both sides."""
-    return tuple([value for name, value in vars(record.spec).items() if name != across])
 
 
 def _settings_across(groups: list[Group], across: str | None) -> tuple[str, ...]:

@@ -32,6 +32,11 @@ def installed_version(distribution: str) -> str | None:
         return None
 
 
+def sapien_version(simulator: str) -> str | None:
+    """Return the installed SAPIEN's version if it is the simulator; else None."""
+    return installed_version("sapien") if simulator == "sapien" else None
+
+
 def installed_versions(distributions: Iterable[str]) -> dict[str, str | None]:
     """Return {distribution: version}; None if one has no metadata."""
     return {name: installed_version(name) for name in distributions}

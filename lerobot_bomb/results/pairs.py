@@ -61,18 +61,20 @@ class PairedComparison:
 
 def pair_with_nominal(records: Sequence[Record]) -> dict[str, list[Pair]]:
     """Return {condition: pairs of unperturbed and perturbed record} of a group's episodes with both."""
-    nominal = {_episode(each): each for each in records if each.spec.perturbations == NONE}
+    nominal = {
+        episode_key(each, "perturbations"): each for each in records if each.spec.perturbations == NONE
+    }
     pairs: dict[str, list[Pair]] = {}
     for record in records:
         condition = record.spec.perturbations
-        if condition != NONE and (unperturbed := nominal.get(_episode(record))):
+        if condition != NONE and (unperturbed := nominal.get(episode_key(record, "perturbations"))):
             pairs.setdefault(condition, []).append((unperturbed, record))
     return pairs
 
 
-def _episode(record: Record) -> tuple[Any, ...]:
-    """Return a key that is equal for records of one episode under any condition."""
-    return tuple([value for name, value in vars(record.spec).items() if name != "perturbations"])
+def episode_key(record: Record, across: str | None) -> tuple[Any, ...]:
+    """Return a key that is equal for records of one episode, whatever this field of its spec."""
+    return tuple([value for name, value in vars(record.spec).items() if name != across])
 
 
 def pairs_of(first: Sequence[Record], second: Sequence[Record]) -> list[Pair]:
