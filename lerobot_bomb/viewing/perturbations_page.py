@@ -29,8 +29,9 @@ lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/galle
 - An **axis** changes one thing and leaves all others alone.
 - A **level** says how strong the change is, from 0 (none) to {MAX_LEVEL}. Colours and directions come from
   the seed, so the levels of one seed differ only in strength.
-- A **condition** is `none`, or one or several axes with levels: `camera:3`, `camera:2+light:3`. Lists of
-  conditions need brackets.
+- A **condition** is `none`, or one or several axes with levels: `camera:3`, `camera:2+light:3`. In
+  `lerobot-eval`, a list of conditions needs brackets: `'["none","camera:3"]'`; our commands also take
+  `none,camera:3`.
 - A **range** such as `camera:1-5` draws the level from the seed. Each axis of `all:1-5` draws its own
   level.
 - `{ALL}:k` is every axis at level k except `goal_marker`, which makes the task easier.
