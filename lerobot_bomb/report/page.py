@@ -16,12 +16,17 @@ MAX_TEXT = 240  # characters of a name or cell that are shown; the rest is shown
 MAX_SUBJECT = 60  # characters of the subject of a sentence
 MAX_HOVER = 6000  # characters shown under the pointer
 MAX_ROWS = 200  # of a table that the page shows; the files beside it have all
+# the gradients of .wide are a shadow at each edge behind which there is more to scroll to
 STYLE = """
 :root{color-scheme:light dark}
 body{background:Canvas;color:CanvasText}
 body{font:15px/1.5 system-ui,sans-serif;max-width:75rem;margin:0 auto;padding:1rem}
 h1{font-size:1.5rem}h2{font-size:1.2rem;margin-top:2.5rem;border-bottom:1px solid #8888}h3{font-size:1rem}
-.wide{overflow-x:auto}
+.wide{overflow-x:auto;background:
+linear-gradient(90deg,Canvas 40%,transparent) 0 0/2rem 100% no-repeat local,
+linear-gradient(270deg,Canvas 40%,transparent) 100% 0/2rem 100% no-repeat local,
+linear-gradient(90deg,#888a,transparent) 0 0/.8rem 100% no-repeat scroll,
+linear-gradient(270deg,#888a,transparent) 100% 0/.8rem 100% no-repeat scroll}
 table{border-collapse:separate;border-spacing:0;font-variant-numeric:tabular-nums}
 th,td{padding:.25rem .6rem;border-bottom:1px solid #8884;text-align:right}
 td{white-space:nowrap}th{vertical-align:bottom}
