@@ -31,8 +31,10 @@ def headline(group: Group) -> str:
     if NONE in rates:
         parts.append(f"**{rates.pop(NONE)}** unperturbed")
     if rates:
-        worst = next(iter(rates))
-        of_all = f", the lowest of {len(rates)} conditions" if len(rates) > 1 else ""
+        worst, *others = rates
+        is_lowest = all(rates[worst].share < rates[other].share for other in others)
+        of_all = "the lowest of" if is_lowest else "none lower in"
+        of_all = f", {of_all} {len(rates)} conditions" if others else ""
         parts.append(f"{rates[worst]} under {code(worst)}{of_all}")
     methods = ", ".join(dict.fromkeys(rate.method for rate in rates_of(group).values()))
     return f"{plain(_title(group))}: {'; '.join(parts)} ({methods})."

@@ -36,6 +36,11 @@ def test_the_headline_names_the_unperturbed_rate_and_the_lowest() -> None:
     )
 
 
+def test_the_headline_of_equal_rates() -> None:
+    tied = headline(group(none=(9, 10), camera_3=(2, 10), light_3=(2, 10)))
+    assert "under `camera:3`, none lower in 2 conditions (" in tied
+
+
 def test_the_headline_of_few_episodes_and_of_one_arm() -> None:
     one = headline(group(none=(1, 1)))
     assert one == (
