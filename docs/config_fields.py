@@ -73,3 +73,16 @@ def default_of(field: dataclasses.Field) -> str:
     value = field.default
     is_unset = value is dataclasses.MISSING or value is None or value == ""
     return "" if is_unset else f"`{spelled(value)}`"
+
+
+def default_in(config_class: type, name: str) -> str:
+    """Return the default of a config's field as Markdown; `-` for a field that it does not have."""
+    field = next((each for each in own_fields(config_class) if each.name == name), None)
+    return "-" if field is None else default_of(field)
+
+
+def meaning_of(config_class: type, name: str) -> str:
+    """Return the explanation of a config's field, with its allowed values."""
+    meaning = comments_of(config_class).get(name, "")
+    allowed = [*map(str, getattr(config_class, "CHOICES", {}).get(name, ()))]
+    return meaning + ("" if all(each in meaning for each in allowed) else f" ({', '.join(allowed)})")

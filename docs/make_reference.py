@@ -5,21 +5,23 @@
 
 import dataclasses
 from argparse import SUPPRESS, Action
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
-from config_fields import comments_of, default_of, is_ours, own_fields
+from config_fields import comments_of, default_in, default_of, is_ours, meaning_of, own_fields
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
 from lerobot.utils.import_utils import register_third_party_plugins
+from policy_flags import FILLED_IN, groups_of, shared_fields
 
 from lerobot_bomb.commands.main import Parser, command_parser
 from lerobot_bomb.commands.table import COMMANDS, PROGRAM
 from lerobot_bomb.conditions import MAX_LEVEL, Axis
 from lerobot_bomb.environments import ENVIRONMENTS
-from lerobot_bomb.policies.flag_groups import flags_of
+from lerobot_bomb.policies.config import VlaConfig
 from lerobot_bomb.results.record import Record, field_names
 
 FOLDER = Path(__file__).parent / "reference"
@@ -33,23 +35,27 @@ def table(header: str, rows: Iterable[Iterable[str]]) -> list[str]:
     return [f"| {header} |", f"|{rule}", *(f"| {row} |" for row in cells), ""]
 
 
-def flag_rows(config_class: type, names: Iterable[str], prefix: str) -> Iterator[list[str]]:
-    """Yield flag, default and explanation of fields of a config."""
-    comments, choices = comments_of(config_class), getattr(config_class, "CHOICES", {})
-    fields = {each.name: each for each in dataclasses.fields(config_class)}
-    for name in names:
-        meaning, allowed = comments.get(name, ""), [*map(str, choices.get(name, ()))]
-        meaning += "" if all(each in meaning for each in allowed) else f" ({', '.join(allowed)})"
-        yield [f"`--{prefix}.{name}`", default_of(fields[name]), meaning]
-
-
-def argument_rows(parser: Parser) -> Iterator[list[str]]:
-    """Yield the arguments of a command, each with its explanation."""
+def argument_rows(parser: Parser) -> dict[str, str]:
+    """{spelling: explanation} of the arguments of a command."""
     formatter = parser._get_formatter()
+    rows = {}
     for action in parser._actions:
         if action.dest != "help" and action.help != SUPPRESS:
             is_required = " (required)" * bool(action.required and action.option_strings)
-            yield [_spelling(action), f"{formatter._expand_help(action)}{is_required}"]
+            rows[_spelling(action)] = f"{formatter._expand_help(action)}{is_required}"
+    return rows
+
+
+def environment_flags(rows: Iterable[dict[str, str]]) -> set[tuple[str, str]]:
+    """Return the rows of environments' flags that several commands explain alike."""
+    uses = Counter(row for arguments in rows for row in arguments.items())
+    names = {f"--env.{each.name}" for config in ours_of(EnvConfig).values() for each in own_fields(config)}
+    return {row for row, count in uses.items() if count > 1 and _long(row[0]) in names}
+
+
+def _long(spelling: str) -> str:
+    """`--env.task`, `--task` -> --env.task."""
+    return spelling.split("`")[1]
 
 
 def _spelling(action: Action) -> str:
@@ -67,6 +73,8 @@ def commands_page() -> str:
         "A flag of the environment has a short form: `--task` for `--env.task`.",
         "",
     ]
+    arguments = {name: argument_rows(command_parser(name)) for name in COMMANDS}
+    linked = environment_flags(arguments.values())
     for group in dict.fromkeys(command.group for command in COMMANDS.values()):
         lines += [f"## {group}", ""]
         for name, command in COMMANDS.items():
@@ -74,8 +82,10 @@ def commands_page() -> str:
                 examples = [f"{PROGRAM} {name} {flags}".rstrip() for flags in command.examples]
                 summary = f"{command.summary[0].upper()}{command.summary[1:]}."
                 lines += [f"### {name}", "", summary, "", "```", *examples, "```", ""]
-                rows = [*argument_rows(command_parser(name))]
+                rows = [row for row in arguments[name].items() if row not in linked]
                 lines += table("argument | meaning", rows) if rows else []
+                flags = ", ".join(f"`{_long(row[0])}`" for row in arguments[name].items() if row in linked)
+                lines += [f"[The environment's flags](environments.md): {flags}.", ""] if flags else []
     return "\n".join(lines)
 
 
@@ -95,38 +105,58 @@ def environments_page() -> str:
         "Flags of LeRobot's own (`lerobot-eval --help`) are not listed.",
         "",
     ]
-    for name, config_class in ours_of(EnvConfig).items():
-        names = [each.name for each in own_fields(config_class)]
-        lines += [f"## {name}", ""]
-        lines += table("flag | default | meaning", flag_rows(config_class, names, "env"))
+    for env_type, config_class in ours_of(EnvConfig).items():
+        rows = [
+            [f"`--env.{each.name}`", default_of(each), meaning_of(config_class, each.name)]
+            for each in own_fields(config_class)
+        ]
+        lines += [f"## {env_type}", "", *table("flag | default | meaning", rows)]
     return "\n".join(lines)
 
 
 def policies_page() -> str:
     """Every field of every policy's config."""
+    types = ours_of(PreTrainedConfig)
+    models = {name: each for name, each in types.items() if issubclass(each, VlaConfig)}
+    shared = shared_fields(models.values())
     lines = [
         "# Flags of the policies",
         "",
         "Flags of `lerobot-train` after `--policy.type=NAME`, and fields of a checkpoint's `config.json`.",
         "Fields of LeRobot's own (`device`, `repo_id`, ...) are not listed.",
         "",
+        "## Shared",
+        "",
+        "A policy's column holds its defaults. Empty: unset. `-`: the policy has no such flag.",
+        "",
     ]
-    for name, config_class in ours_of(PreTrainedConfig).items():
-        names = [each.name for each in own_fields(config_class)]
-        research, filled_in = (flags_of(config_class, group) for group in ("RESEARCH", "FILLED_IN"))
-        groups = {
-            "Listed by `--help`": [each for each in names if each not in {*research, *filled_in}],
-            "For research, not in `--help`": [each for each in names if each in research],
-        }
-        lines += [f"## {name}", ""]
-        for title, members in groups.items():
-            if members:
-                rows = flag_rows(config_class, members, "policy")
-                lines += [f"**{title}**", "", *table("flag | default | meaning", rows)]
-        comments = comments_of(config_class)
-        rows = [[f"`{each}`", comments.get(each, "")] for each in names if each in filled_in]
-        lines += ["**Filled in by the code**", "", *table("field | meaning", rows)] if rows else []
+    for title, meanings in shared.items():
+        lines += group_table(title, meanings, models)
+    for policy_type, config_class in types.items():
+        lines += [f"## {policy_type}", ""]
+        lines += ["Also [the shared flags](#shared).", ""] if policy_type in models else []
+        for title, names in groups_of(config_class).items():
+            others = shared[title] if policy_type in models else {}
+            own = {each: meaning_of(config_class, each) for each in names if each not in others}
+            lines += group_table(title, own, {"default": config_class})
     return "\n".join(lines)
+
+
+def group_table(title: str, meanings: dict[str, str], types: dict[str, type]) -> list[str]:
+    """Lay out fields of a group, with a column of defaults per type; what the code fills in has none."""
+    if not meanings:
+        return []
+    if title == FILLED_IN:
+        rows = table("field | meaning", [[f"`{name}`", meaning] for name, meaning in meanings.items()])
+    else:
+        rows = table(
+            " | ".join(["flag", *types, "meaning"]),
+            [
+                [f"`--policy.{name}`", *(default_in(each, name) for each in types.values()), meaning]
+                for name, meaning in meanings.items()
+            ],
+        )
+    return [f"**{title}**", "", *rows]
 
 
 def record_types() -> Sequence[type[Record]]:
@@ -144,17 +174,21 @@ def axes_page() -> str:
         "[perturbations](../perturbations.md).",
         "",
     ]
+    first: dict[str, str] = {}  # {text of an axis: the environment that has it first}
     for record_type in record_types():
         for name, axis in record_type.condition.axes.items():
-            lines += [f"## {record_type.env_type}: {name}", "", *_axis(axis)]
-            lines += table(f"quantity | {levels} | unit | meaning", _magnitudes(axis))
-            lines += _sheet(record_type.env_type, name)
+            env_type = record_type.env_type
+            text = [f"{_summary(axis)}{_sheet(env_type, name)}", ""]
+            rows = table(f"quantity | {levels} | unit | meaning", _magnitudes(axis))
+            like = first.setdefault("\n".join([_summary(axis), *rows]), env_type)
+            same = [f"Its levels are [those of {like}](#{like}-{name}).", ""]
+            lines += [f"## {env_type}: {name}", "", *text, *(rows if like == env_type else same)]
     return "\n".join(lines)
 
 
-def _axis(axis: Axis) -> list[str]:
+def _summary(axis: Axis) -> str:
     summary = f"{axis.summary[0].upper()}{axis.summary[1:]}. Changes: {', '.join(axis.changes)}."
-    return [summary + " Not part of `all`: it helps." * axis.is_help, ""]
+    return summary + " Not part of `all`: it helps." * axis.is_help
 
 
 def _magnitudes(axis: Axis) -> Iterator[list[str]]:
@@ -162,10 +196,10 @@ def _magnitudes(axis: Axis) -> Iterator[list[str]]:
         yield [quantity, *(f"{value:g}" for value in size.levels), size.unit, size.what]
 
 
-def _sheet(env_type: str, axis: str) -> list[str]:
+def _sheet(env_type: str, axis: str) -> str:
     folder = "perturbations" if env_type == "bomb" else env_type
     path = f"media/{folder}/{axis}.jpg"
-    return [f"[Its pictures](../{path})", ""] if (FOLDER.parent / path).is_file() else []
+    return f" [Pictures](../{path})." if (FOLDER.parent / path).is_file() else ""
 
 
 def records_page() -> str:
@@ -173,33 +207,47 @@ def records_page() -> str:
     lines = [
         "# Fields of a record",
         "",
-        "A results file (`--env.results_path`) has a JSON object, a *record*, for each finished episode.",
+        "A results file (`--env.results_path`) has a JSON object, a *record*, for each finished episode: the",
+        "fields of its environment, and those [of all environments](#all-environments).",
         "How records are pooled and compared: [protocol](../benchmark.md#records).",
         "",
     ]
-    nested: dict[str, type] = {}
-    for record_type in record_types():
-        version = list(record_type.versions)[-1]
-        lines += [f"## {record_type.env_type}", "", f"Protocol `{version}`.", ""]
-        lines += table("field | JSON | meaning", record_rows(record_type, nested))
-    for name, shared in nested.items():
-        lines += [f"## {name}", "", *table("field | JSON | meaning", _rows(shared, name))]
+    rows = {each: [*map(tuple, record_rows(each))] for each in record_types()}
+    shared = [row for row in next(iter(rows.values())) if all(row in each for each in rows.values())]
+    alike: dict[tuple, list[type[Record]]] = {}
+    for record_type, each in rows.items():
+        alike.setdefault(tuple(row for row in each if row not in shared), []).append(record_type)
+    for own, types in alike.items():
+        versions = ", ".join(f"`{list(each.versions)[-1]}`" for each in types)
+        lines += [f"## {', '.join(each.env_type for each in types)}", "", f"Protocol {versions}.", ""]
+        lines += table("field | JSON | meaning", own)
+    lines += ["## All environments", "", *table("field | JSON | meaning", shared)]
+    for name, inner in {name: each for types in rows for name, each in nested_in(types).items()}.items():
+        lines += [f"## {name}", "", *table("field | JSON | meaning", _rows(inner, name))]
     return "\n".join(lines)
 
 
-def record_rows(record_type: type[Record], nested: dict[str, type]) -> Iterator[list[str]]:
-    """Yield the fields of a record; objects that all environments share are put into `nested`."""
+def nested_in(record_type: type[Record]) -> dict[str, type]:
+    """{field of a record that is an object: its type}, without the spec."""
+    hints = get_type_hints(record_type, include_extras=True)
+    inner = {name: _dataclass_of(hints[name]) for name in field_names(record_type) if name != "spec"}
+    return {name: each for name, each in inner.items() if each is not None}
+
+
+def record_rows(record_type: type[Record]) -> Iterator[list[str]]:
+    """Yield the fields of a record."""
     hints, comments = get_type_hints(record_type, include_extras=True), comments_of(record_type)
+    nested = nested_in(record_type)
     for name in field_names(record_type):
-        inner = next(filter(dataclasses.is_dataclass, _members(hints[name])), None)
-        if inner is not None and name != "spec":
-            nested[name] = inner  # pyright: ignore[reportArgumentType]
-            kind = f"object: [below](#{name}), or null"
-            yield [f"`{name}`", kind, comments.get(name, "")]
-        elif inner is not None:
-            yield from _rows(inner, name)
+        if name == "spec":
+            yield from _rows(_dataclass_of(hints[name]), name)
         else:
-            yield [f"`{name}`", json_kind(hints[name]), comments.get(name, "")]
+            kind = f"object: [below](#{name}), or null" if name in nested else json_kind(hints[name])
+            yield [f"`{name}`", kind, comments.get(name, "")]
+
+
+def _dataclass_of(hint: Any) -> Any:
+    return next(filter(dataclasses.is_dataclass, _members(hint)), None)
 
 
 def _rows(cls: Any, prefix: str) -> Iterator[list[str]]:

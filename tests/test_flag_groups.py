@@ -39,11 +39,17 @@ def test_a_flag_that_is_not_listed_works(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_the_reference_lists_every_flag_in_its_group(name: str) -> None:
-    section = PAGE.read_text().partition(f"\n## {name}\n")[2].partition("\n## ")[0]
-    _, *tables = re.split(r"^\*\*.*\*\*$", section, flags=re.MULTILINE)
-    listed, research, filled_in = (
-        set(re.findall(r"^\| `(?:--policy\.)?(\w+)`", rows, re.M)) for rows in tables
-    )
+    tables = {"Listed": set(), "For research": set(), "Filled in": set()}
+    for heading in ("Shared", name):
+        section = PAGE.read_text().partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
+        for title, found in tables.items():
+            rows = section.partition(f"\n**{title}")[2].partition("\n**")[0]
+            column = sorted(CASES).index(name) if heading == "Shared" and title != "Filled in" else 0
+            for flag, cells in re.findall(r"^\| `(?:--policy\.)?(\w+)` \| (.*) \|$", rows, re.M):
+                if cells.split("|")[column].strip() != "-":
+                    assert flag not in found
+                    found.add(flag)
+    listed, research, filled_in = tables.values()
     config_class = PreTrainedConfig.get_choice_class(name)
     assert research == {*flags_of(config_class, "RESEARCH")}
     assert filled_in < {*flags_of(config_class, "FILLED_IN")}  # the others are LeRobot's

@@ -42,10 +42,13 @@ def test_every_command_and_argument_is_there(made: dict[str, str]) -> None:
     found = sections(made["commands.md"], "###")
     assert found.keys() == COMMANDS.keys()
     for name, text in found.items():
-        options = [
-            each for each in command_parser(name)._option_string_actions if each not in ("-h", "--help")
-        ]
-        assert {*options} <= {*first_cells(text)}
+        options = {*command_parser(name)._option_string_actions} - {"-h", "--help"}
+        linked = re.findall(
+            r"`(--env\.\w+)`", "".join(re.findall(r"^\[The environment's flags\].*", text, re.M))
+        )
+        assert {*linked} <= {*first_cells(made["environments.md"])} - {*first_cells(text)}
+        short_forms = {each.replace("--env.", "--") for each in linked}
+        assert options <= {*first_cells(text), *linked, *short_forms}
         assert all(f"lerobot-bomb {name} {flags}".rstrip() in text for flags in COMMANDS[name].examples)
 
 
@@ -57,6 +60,7 @@ def test_every_field_that_lerobot_does_not_have_is_there(
     page: str, registry: Any, prefix: str, known: str, made: dict[str, str]
 ) -> None:
     types, found = ours_of(registry), sections(made[page])
+    shared = found.pop("Shared", "")
     assert known in types and found.keys() == types.keys()
     for name, config_class in types.items():
         stock = {
@@ -66,7 +70,8 @@ def test_every_field_that_lerobot_does_not_have_is_there(
             for each in vars(base).get("__annotations__", ())
         }
         names = {each.name for each in dataclasses.fields(config_class)} - stock
-        listed = {each.removeprefix(f"--{prefix}.") for each in first_cells(found[name])}
+        text = found[name] + (shared if "(#shared)" in found[name] else "")
+        listed = {each.removeprefix(f"--{prefix}.") for each in first_cells(text)}
         assert names <= listed
 
 
@@ -79,11 +84,21 @@ def test_every_axis_is_there(made: dict[str, str]) -> None:
     )
 
 
+def test_a_shared_flag_has_the_default_of_each_policy(made: dict[str, str]) -> None:
+    header, *rows = re.findall(r"^\| (.*) \|$", sections(made["policies.md"])["Shared"], re.M)
+    assert header == "flag | fdvla | spatialvla_grid | vla0_smol | meaning"
+    cells = {row.partition(" | ")[0]: row.split(" | ")[1:4] for row in rows}
+    assert cells["`--policy.n_action_steps`"] == ["`8`", "`4`", "`5`"]
+    assert cells["`--policy.relative_actions`"] == ["`false`", "-", "`false`"]
+
+
 def test_every_field_of_a_record_is_there(made: dict[str, str]) -> None:
     found = sections(made["records.md"])
+    shared = {*first_cells(found["All environments"])}
+    of_types = {env_type: text for heading, text in found.items() for env_type in heading.split(", ")}
     for record_type in record_types():
-        names = {name.partition(".")[0] for name in first_cells(found[record_type.env_type])}
-        assert names == {*field_names(record_type)}
+        names = {name.partition(".")[0] for name in first_cells(of_types[record_type.env_type])}
+        assert names | shared == {*field_names(record_type)} and not names & shared
     assert {"policy.weights_sha256", "inference.latency_p50_ms"} <= {*first_cells(made["records.md"])}
 
 

@@ -34,8 +34,8 @@ class BombEnvConfig(EvaluatedEnv, EnvConfig):
 
     # suite: place, object, spatial, goal, long, or all
     task: str | None = "place"
-    # numbered tasks of the suite, of place 25 x colour + 5 x row + column with black = 0, white = 1; unset
-    # draws one per episode
+    # numbered tasks of the suite, as [0,7,12]; of place 25 x colour + 5 x row + column with black = 0,
+    # white = 1; unset draws one per episode
     task_ids: list[int] | None = None
     # control steps per second; a divisor of 200
     fps: int = DEFAULT_FPS

@@ -141,14 +141,14 @@ def add_dataset_arguments(parser: argparse.ArgumentParser, about: str = "") -> N
     """Declare which dataset is read."""
     add = parser.add_argument
     add("--dataset.repo_id", dest="repo_id", required=True, help=f"name of the dataset{about}")
-    root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
+    root = "folder of the dataset (default: $HF_LEROBOT_HOME/REPO_ID)"
     add("--dataset.root", dest="root", type=path_flag, help=root)
 
 
 def add_new_dataset_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare name and folder of a new dataset."""
     parser.add_argument("--repo_id", required=True, help="name of the dataset on the Hub, USER/NAME")
-    root = "new folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
+    root = "new folder of the dataset (default: $HF_LEROBOT_HOME/REPO_ID)"
     parser.add_argument("--root", type=path_flag, help=root)
 
 

@@ -11,7 +11,7 @@ def add_conversion_arguments(parser: argparse.ArgumentParser, path: str) -> None
     """Declare source and dataset of a conversion."""
     parser.add_argument("path", type=path_flag, help=path)
     add_new_dataset_arguments(parser)
-    summary = "continue a conversion that was interrupted; its finished blocks of episodes are kept"
+    summary = "continue an interrupted conversion"
     parser.add_argument("--resume", **switch(), help=summary)
 
 

@@ -75,15 +75,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--noise",
         type=float,
         default=0.0,
-        help="standard deviation of noise on the executed action, in units of the largest step, 40 mm; the "
-        "stored action is clean, so the data show recoveries; the expert copes with 0.05 (default: 0)",
+        help="standard deviation of noise on the executed action, in units of 40 mm; the stored action is "
+        "clean; the expert copes with 0.05 (default: 0)",
     )
-    add(
-        "--resume",
-        **switch(),
-        help="continue a recording that was interrupted; its finished blocks of episodes are kept "
-        "(with --shard and --join, always)",
-    )
+    resume = "continue an interrupted recording (with --shard and --join, always)"
+    add("--resume", **switch(), help=resume)
     where = add_job_arguments(parser, "episodes", f"ROOT.{JOBS}/{SCRIPT}")
     where.add_argument("--join", **switch(), help="make the dataset of the parts of --shard, and delete them")
 
@@ -96,8 +92,8 @@ def _add_what_is_recorded(parser: argparse.ArgumentParser) -> None:
     number.add_argument(
         "--static",
         type=int,
-        help="static scenes to record instead: a board as in mid-episode, the gripper anywhere, with or "
-        "without the stone; a frame each, with the labels of --pointing",
+        help="static scenes to record instead: single frames of boards as in mid-episode, with the labels of "
+        "--pointing",
     )
     add("--relabel", **switch(), help="let --policy.path run the episodes, and store the expert's actions")
     add(
@@ -109,8 +105,8 @@ def _add_what_is_recorded(parser: argparse.ArgumentParser) -> None:
     add(
         "--pointing",
         **switch(),
-        help="also store which stone goes where and the expert's actions for other places: the labels of "
-        "--policy.pointing=true, which no policy sees in an evaluation",
+        help="also store what --policy.pointing=true learns from: which stone goes where, and the expert's "
+        "actions for other places",
     )
 
 

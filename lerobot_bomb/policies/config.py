@@ -58,7 +58,7 @@ class ChunkConfig(ConfigWithEnvironment):
     chunk_size: int = 1
     # actions executed before the next prediction
     n_action_steps: int = 1
-    # how images, state and action are normalised; images stay in [0, 1]
+    # how images, state and action are normalised
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "VISUAL": NormalizationMode.IDENTITY,
@@ -87,8 +87,7 @@ class ChunkConfig(ConfigWithEnvironment):
     optimizer_weight_decay: float = 0.0
     # largest norm of the gradients
     optimizer_grad_clip_norm: float = 1.0
-    # steps in which the learning rate rises; with fewer --steps LeRobot shortens warm-up and decay, so set
-    # scheduler_decay_steps too
+    # steps in which the learning rate rises; LeRobot shortens them if --steps is below scheduler_decay_steps
     scheduler_warmup_steps: int = 1_000
     # steps after which the cosine schedule ends
     scheduler_decay_steps: int = 30_000
@@ -177,7 +176,7 @@ class VlaConfig(ChunkConfig):
     crop_fraction: float = 1.0
     # put the robot's state into the prompt
     use_state: bool = True
-    # do not train the vision model
+    # do not train the vision model; a nano model needs false
     freeze_vision_encoder: bool = False
     # "bfloat16": autocast over float32 weights, in training and evaluation
     dtype: str = "float32"
@@ -189,8 +188,8 @@ class VlaConfig(ChunkConfig):
 
     # predict at every step and execute the mean of this many newest chunks; 0: off. Needs n_action_steps=1
     temporal_ensemble_size: int = 0
-    # weights in that mean: "uniform", "exponential" (exp(coefficient * age)), "nvlabs" (1 for the newest, 0.5
-    # for others) or "adaptive" (exp(coefficient * cosine with the newest action))
+    # weights in the ensemble's mean: "uniform", "exponential" (exp(coefficient * age)), "nvlabs" (1 for the
+    # newest, 0.5 for others) or "adaptive" (exp(coefficient * cosine with the newest action))
     temporal_ensemble_weighting: str = "uniform"
     # coefficient of these weights; with "exponential" above 0 favours old chunks
     temporal_ensemble_coefficient: float = 0.01

@@ -92,7 +92,7 @@ class Record(ABC):
     failure: str | None  # failure class; null: success
     levels: dict[str, Natural]  # {perturbation axis that was on: its level}
     image_size: int | str  # width and height of the images in pixels
-    policy: PolicyIdentity | None  # null: not known
+    policy: PolicyIdentity | None  # policy that acted; null: not known
     machine: str  # processor and C library
     lerobot_version: str | None  # installed LeRobot
     torch_version: str | None  # installed torch

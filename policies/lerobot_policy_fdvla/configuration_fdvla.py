@@ -85,7 +85,7 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
     # base model: Hub id, local folder, or "nano", a small model with random weights that needs no network
     vlm_model_name: str = "Qwen/Qwen2.5-VL-3B-Instruct"
 
-    # actions sampled at once
+    # actions predicted at once
     chunk_size: int = 16
     # actions executed before the next prediction
     n_action_steps: int = 8
@@ -147,7 +147,8 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
     denoise_tau_min: float = DENOISE_TAU_MIN
     # bound of the actions that ddim infers, normalised
     clip_sample_range: float = CLIP_SAMPLE_RANGE
-    # weights in the ensemble's mean: "uniform", "exponential", "nvlabs" or "adaptive"
+    # weights in the ensemble's mean: "uniform", "exponential" (exp(coefficient * age)), "nvlabs" (1 for the
+    # newest, 0.5 for others) or "adaptive" (exp(coefficient * cosine with the newest action))
     temporal_ensemble_weighting: str = "exponential"
     # seed of the noise from which actions are sampled
     noise_seed: int = 0

@@ -78,7 +78,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
     # text around the instruction, which {} stands for, in lower case. SpatialVLA's slides have "What action
     # should the robot take to {}?"
     task_template: str = BARE_TASK
-    # put the robot's state, in 256 bins, into the prompt
+    # put the robot's state into the prompt
     use_state: bool = False
 
     # groups of action dimensions, a token each per step: [{"dims": [0, 1, 2], "transform": "polar", "bins":
@@ -138,9 +138,10 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
     # up to ties within rounding. Used for batches of 1, not on CUDA
     draft: str = "repeat"
 
-    # weights in the ensemble's mean: "uniform", "exponential", "nvlabs" or "adaptive"
+    # weights in the ensemble's mean: "uniform", "exponential" (exp(coefficient * age)), "nvlabs" (1 for the
+    # newest, 0.5 for others) or "adaptive" (exp(coefficient * cosine with the newest action))
     temporal_ensemble_weighting: str = "adaptive"
-    # coefficient of these weights
+    # coefficient of these weights; with "exponential" above 0 favours old chunks
     temporal_ensemble_coefficient: float = 0.1
 
     # side of the crop as a share of the image's; placed at random in training, centred in evaluation

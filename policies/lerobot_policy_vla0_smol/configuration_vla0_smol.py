@@ -60,7 +60,7 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig, PointingVlaConfig):
     # which takes multiples of 28
     image_size: int | None = None
 
-    # actions written at once
+    # actions predicted at once
     chunk_size: int = 10
     # actions executed before the next prediction
     n_action_steps: int = 5
