@@ -11,28 +11,22 @@ policy of this shape is then timed from images to actions.
 import copy
 import logging
 import statistics
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
-from unittest.mock import patch
 
 import torch
-from decode_speed_works import Timed, XgrammarGenerate, compare
+from decode_ways import NumbersByGenerate, NumbersByUs, compare
 from machine import (
     Rows,
-    add_machine_arguments,
+    device_name,
     finish,
     make_parser,
+    parse_on_idle_machine,
     positive,
     print_rows,
-    require_cuda,
-    require_idle_machine,
     wait_and_time,
 )
 from random_policies import features, make_batches
-from torch import Tensor
 
-from lerobot_bomb.cuda_graphs import GraphedFunction
 from lerobot_bomb.decoding.decoder import Guess, Prompt
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
@@ -44,7 +38,7 @@ from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer
 from lerobot_policy_vla0_smol import Vla0SmolConfig
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
-MIN_RATIO = 8.0  # in bfloat16, one prompt at a time
+BAR_IS_ON, MIN_RATIO = "bfloat16, batch of 1", 8.0
 PARTS = "decode", "policy"
 BATCH_SIZES = 1, 16
 PROMPT_LENGTH, NUM_STEPS, NUM_DIMS = 190, 10, 7
@@ -77,33 +71,26 @@ def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--repeats", type=positive, default=10, help="answers of each (default: 10)")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="default: all")
-    add_machine_arguments(parser)
-    args = parser.parse_args()
-    require_cuda("benchmarks/decode_speed.py measures on a CPU.")
-    require_idle_machine(args.force)
-    print(torch.cuda.get_device_name(), f"torch {torch.__version__}")
+    args = parse_on_idle_machine(parser)
+    figures: dict[str, Any] = {"device": device_name("cuda")}
+    bars: dict[str, bool] = {}
     logging.disable(logging.WARNING)
     torch.manual_seed(0)
-    figures: dict[str, Any] = {"device": torch.cuda.get_device_name()}
-    bars: dict[str, bool] = {}
     if "decode" in args.parts:
-        figures |= time_decoding_all(args.repeats, bars)
-    if "policy" in args.parts:
-        figures["policy"] = time_policy(args.repeats)
-    finish(args.json, figures, bars)
-
-
-def time_decoding_all(repeats: int, bars: dict[str, bool]) -> dict[str, Any]:
-    """Time decoding in both precisions and both sizes of batch."""
-    figures = {}
-    backbone = build_backbone(config_500m()).cuda().eval()
-    with torch.inference_mode():
+        backbone = build_backbone(config_500m()).cuda().eval()
         for dtype in (torch.float32, torch.bfloat16):
+            repeats = args.repeats if dtype == torch.bfloat16 else min(args.repeats, 3)
             for batch_size in BATCH_SIZES:
                 name = f"{str(dtype).removeprefix('torch.')}, batch of {batch_size}"
-                num_answers = repeats if dtype == torch.bfloat16 else min(repeats, 3)
-                figures[name] = time_decoding(backbone, dtype, batch_size, num_answers, bars, name)
-    return figures
+                figures[name] = time_decoding(backbone, dtype, batch_size, repeats)
+                print_rows(f"{name}, medians of {repeats}", figures[name])
+        gain = figures[BAR_IS_ON]["ours, no draft"]["decode_gain"]
+        bars[f"{BAR_IS_ON}: decode {gain:.1f} times faster (bar {MIN_RATIO:g})"] = gain >= MIN_RATIO
+    if "policy" in args.parts:
+        figures["policy"] = time_policy(args.repeats)
+        title = f"policy, chunks of {NUM_STEPS} actions of {NUM_DIMS}, all executed, no draft right"
+        print_rows(title, figures["policy"])
+    finish(args.json, figures, bars)
 
 
 def config_500m() -> dict[str, Any]:
@@ -113,83 +100,30 @@ def config_500m() -> dict[str, Any]:
     return config | {"scale_factor": 4, "vision_config": VISION_500M}
 
 
-def time_decoding(
-    backbone: SmolVLMBackbone,
-    dtype: torch.dtype,
-    batch_size: int,
-    repeats: int,
-    bars: dict[str, bool],
-    name: str,
-) -> Rows:
+@torch.inference_mode()
+def time_decoding(backbone: SmolVLMBackbone, dtype: torch.dtype, batch_size: int, repeats: int) -> Rows:
     """Time whole chunks by the peer and by us, without and with drafts."""
     grammar = NumberGrammar(512, NUM_STEPS * NUM_DIMS).cuda()
     written = torch.ones(batch_size, PROMPT_LENGTH, dtype=torch.bool, device="cuda")
-    prompts = [
-        Prompt(torch.randn(batch_size, PROMPT_LENGTH, TEXT_500M["hidden_size"], device="cuda"), written)
-        for _ in range(repeats)
-    ]
+    shape = batch_size, PROMPT_LENGTH, TEXT_500M["hidden_size"]
+    prompts = [Prompt(torch.randn(shape, device="cuda"), written) for _ in range(repeats)]
     symbol_ids = torch.arange(30, 42, device="cuda")
-    stock = copy.deepcopy(backbone).to(dtype)
-    cast = [Prompt(prompt.embeds.to(dtype), written) for prompt in prompts]
+
+    def ours(guess: Guess, *, compiled: bool) -> NumbersByUs:
+        writer = NumberWriter(backbone, grammar, guess, compiled=compiled)
+        return NumbersByUs(writer, symbol_ids, grammar.num_numbers, dtype)
+
     known, linear = KnownSymbols(grammar), LinearDraft(grammar, NUM_DIMS)
-    ways: dict[str, tuple[Guess, bool]] = {
-        "ours, no draft": (known, False),
-        "ours, no draft, compiled": (known, True),
-        "ours, linear draft, compiled": (linear, True),
-    }
-    ours = {
-        way: Ours(NumberWriter(backbone, grammar, guess, compiled=compiled), symbol_ids, dtype)
-        for way, (guess, compiled) in ways.items()
-    }
-    figures = compare(
+    peer = NumbersByGenerate(copy.deepcopy(backbone).to(dtype), symbol_ids, grammar)
+    return compare(
         {
-            "generate, xgrammar": (XgrammarGenerate(stock, symbol_ids, grammar).timed, cast),
-            **{way: (write, prompts) for way, write in ours.items()},
+            "generate, xgrammar": (peer, [Prompt(embeds.to(dtype), mask) for embeds, mask, _ in prompts]),
+            "ours, no draft": (ours(known, compiled=False), prompts),
+            "ours, no draft, compiled": (ours(known, compiled=True), prompts),
+            "ours, linear draft, compiled": (ours(linear, compiled=True), prompts),
         },
         must_agree=dtype == torch.float32,
     )
-    print_rows(f"{name}, medians of {repeats}", figures)
-    gain = figures["ours, no draft"]["decode_gain"]
-    if (dtype, batch_size) == (torch.bfloat16, 1):
-        bars[f"{name}: decode {gain:.1f} times faster (bar {MIN_RATIO:g})"] = gain >= MIN_RATIO
-    return figures
-
-
-class Ours:
-    """Writes an answer; times the whole, and the first pass, which reads the prompt."""
-
-    def __init__(self, writer: NumberWriter, symbol_ids: Tensor, dtype: torch.dtype):
-        self._writer, self._symbol_ids, self._dtype = writer, symbol_ids, dtype
-
-    def __call__(self, prompt: Prompt) -> Timed:
-        started = torch.cuda.Event(enable_timing=True)
-        with (
-            torch.autocast("cuda", dtype=torch.bfloat16, enabled=self._dtype == torch.bfloat16),
-            ends_of_passes() as ends,
-        ):
-            torch.cuda.synchronize()
-            started.record()
-            decoded, whole_s = wait_and_time(
-                lambda: self._writer(prompt, self._symbol_ids, NUM_STEPS * NUM_DIMS)
-            )
-        prefill_s = started.elapsed_time(ends[0]) / 1e3
-        return Timed(decoded.numbers, prefill_s, whole_s - prefill_s, decoded.num_passes)
-
-
-@contextmanager
-def ends_of_passes() -> Iterator[list[torch.cuda.Event]]:
-    """Collect the event at which the device was done with each captured pass."""
-    ends: list[torch.cuda.Event] = []
-    replay: Callable[..., Any] = GraphedFunction.__call__
-
-    def timed(*args: Any) -> Any:
-        returned = replay(*args)
-        ends.append(torch.cuda.Event(enable_timing=True))
-        ends[-1].record()
-        return returned
-
-    with patch.object(GraphedFunction, "__call__", timed):
-        yield ends
 
 
 def time_policy(repeats: int) -> Rows:
@@ -209,7 +143,6 @@ def time_policy(repeats: int) -> Rows:
                 "latency_ms": 1e3 * latency_s,
                 "actions_a_second": batch_size * NUM_STEPS / latency_s,
             }
-    print_rows(f"policy, chunks of {NUM_STEPS} actions of {NUM_DIMS}, all executed, no draft right", figures)
     return figures
 
 

@@ -5,8 +5,8 @@
 
 All ways use the same policy and weights, see the same random images and start from the same noise, so their
 actions must agree. The models have random weights: nano, and the shape of Qwen2.5-0.5B with a vision model of
-3 layers. The bar compares with reading the whole prompt, images included, in every step; a second row sees
-the images once. On CUDA a query's sampling steps are one CUDA graph; one row runs without it.
+3 layers. The bar compares with reading the whole prompt, images included, in every step. On CUDA a query's
+sampling steps are one CUDA graph; one row runs without it.
 """
 
 import logging
@@ -19,13 +19,12 @@ from unittest.mock import patch
 import torch
 from machine import (
     Rows,
-    add_machine_arguments,
+    device_name,
     finish,
     make_parser,
+    parse_on_idle_machine,
     positive,
     print_rows,
-    require_cuda,
-    require_idle_machine,
     wait_and_time,
 )
 from random_policies import features, make_batches
@@ -61,16 +60,9 @@ def main() -> None:
     parser.add_argument("--repeats", type=positive, default=10, help="queries of each (default: 10)")
     parts = tuple(BATCH_SIZES)
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts, help="models (default: all)")
-    add_machine_arguments(parser)
-    args = parser.parse_args()
-    if args.device == "cuda":
-        require_cuda("give --device=cpu.")
-    require_idle_machine(args.force)
+    args = parse_on_idle_machine(parser)
     logging.disable(logging.WARNING)
-    figures: dict[str, Any] = {"device": args.device}
-    if args.device == "cuda":
-        figures["device"] = torch.cuda.get_device_name()
-    print(figures["device"], f"torch {torch.__version__}")
+    figures: dict[str, Any] = {"device": device_name(args.device)}
     bars: dict[str, bool] = {}
     for model in args.parts:
         for dtype in ("float32", "bfloat16") if args.device == "cuda" else ("float32",):
@@ -86,7 +78,6 @@ def main() -> None:
                 if batch_size == 1:
                     bars[f"{name}: {gain:.1f} times faster (bar {MIN_RATIO:g})"] = gain >= MIN_RATIO
             del policy
-    print()
     finish(args.json, figures, bars)
 
 
@@ -112,8 +103,7 @@ def make_policy(model: str, device: str, dtype: str) -> FdvlaPolicy:
 def time_queries(policy: FdvlaPolicy, batches: list[dict[str, Any]]) -> Rows:
     """Time every way on every batch, in turn; all must give the same actions."""
     ways: dict[str, Callable[[dict[str, Any]], Tensor]] = {
-        EVERY_STEP: partial(read_in_every_step, policy, sees_once=False),
-        "the same, images seen once": partial(read_in_every_step, policy, sees_once=True),
+        EVERY_STEP: partial(read_in_every_step, policy),
         ONCE: policy.predict_action_chunk,
     }
     if policy.config.device == "cuda":
@@ -143,20 +133,15 @@ def time_queries(policy: FdvlaPolicy, batches: list[dict[str, Any]]) -> Rows:
     }
 
 
-def read_in_every_step(policy: FdvlaPolicy, batch: dict[str, Any], *, sees_once: bool) -> Tensor:
-    """Sample a chunk, reading the prompt anew in every step; the images too, unless `sees_once`."""
-    embed = policy.embed
+def read_in_every_step(policy: FdvlaPolicy, batch: dict[str, Any]) -> Tensor:
+    """Sample a chunk, reading the prompt and its images anew in every step."""
+
+    def heads(actions: Tensor, tau: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        return policy._heads(policy._read(batch))(actions, tau)
+
+    shape = len(batch["observation.state"]), policy.config.chunk_size, NUM_DIMS
     with policy.autocast(), torch.no_grad():
-        if sees_once:
-            embeds = embed(batch, policy.prompt(batch).ids)
-            embed = lambda *_: embeds  # noqa: E731
-        with patch.object(policy, "embed", embed):
-
-            def heads(actions: Tensor, tau: Tensor) -> tuple[Tensor | None, Tensor | None]:
-                return policy._heads(policy._read(batch))(actions, tau)
-
-            shape = len(batch["observation.state"]), policy.config.chunk_size, NUM_DIMS
-            return policy._denoise(heads, policy._noise(None, shape), policy._step_noise(shape))
+        return policy._denoise(heads, policy._noise(None, shape), policy._step_noise(shape))
 
 
 def uncaptured(policy: FdvlaPolicy, batch: dict[str, Any]) -> Tensor:

@@ -11,20 +11,22 @@ Shapes: `B` points of a batch, each a chunk of K = 1 action with D = 2 dims, `N`
 `H` width.
 """
 
+import argparse
 import time
 from dataclasses import asdict, dataclass
 from functools import partial
+from pathlib import Path
 
 import torch
-from flow_toy_plot import draw_plot, near_modes, plot
-from machine import make_parser, positive, writable, write_figures
+from machine import add_json_argument, finish, make_parser, positive, print_rows, writable
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from lerobot_bomb.flow.losses import joint_loss
 from lerobot_bomb.flow.path import draw_tau, path_point
 from lerobot_bomb.flow.samplers import sample
-from lerobot_bomb.tables import print_table
 from lerobot_policy_fdvla.configuration_fdvla import CONSISTENCY_LOSS_WEIGHT
 from lerobot_policy_fdvla.networks_fdvla import ActionSegment, Head
 
@@ -43,6 +45,9 @@ SAMPLING_STEPS = 100  # few steps make the spread too small, whatever the heads 
 # bars: least and largest share of the samples near a mode, by the data's
 SHARE_BARS = {1.0: (0.99, 1.0), 0.5: (0.4, 0.6), 0.0: (0.0, 0.01)}
 MEAN_BAR, STD_BAR = 0.1, 0.15  # largest errors of a mode
+
+PLOT_SUFFIXES = ".png", ".jpg"
+HALF_RANGE = 1.9  # a panel of the plot shows this far to every side of the origin
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,16 @@ class Row:
     mean_error: float  # largest distance of a mode's mean to the data's; NaN if a mode is empty
     std_error: float  # largest of all modes and dims, as a share of the data's; NaN likewise
     passes: bool
+
+    def figures(self) -> dict[str, float]:
+        """Return what the table shows; all but the distance of the means in per cent."""
+        left, right = self.shares
+        return {
+            "left_%": 100 * left,
+            "right_%": 100 * right,
+            "error_of_means": self.mean_error,
+            "error_of_spreads_%": 100 * self.std_error,
+        }
 
 
 class Toy(nn.Module):
@@ -109,7 +124,7 @@ def main() -> None:
     parser.add_argument("--steps", type=positive, default=1000, help="of training, each variant")
     parser.add_argument("--samples", type=positive, default=1000, help="of each word")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=writable, help="also write the figures to this file")
+    add_json_argument(parser)
     parser.add_argument("--plot", type=plot, help="draw the samples into this file")
     args = parser.parse_args()
     if args.samples < MIN_SAMPLES:
@@ -125,16 +140,23 @@ def main() -> None:
             measure(name, word, WORDS[word] if variant.use_dualmod else BOTH, points_ND)
             for word, points_ND in samples[name].items()
         ]
-    print_rows(rows, seconds)
-    settings = {"steps": args.steps, "samples": args.samples, "seed": args.seed}
-    write_figures(args.json, {**settings, "cpu_s": seconds, "rows": [asdict(row) for row in rows]})
+    print_rows("variant, word", {f"{row.variant}, {row.word}": row.figures() for row in rows})
     if args.plot is not None:
         generator = torch.Generator().manual_seed(args.seed)
         words = {word: torch.full((args.samples,), i) for i, word in enumerate(WORDS)}
         data = {word: draw_points(words_N, generator)[:, 0] for word, words_N in words.items()}
-        draw_plot(args.plot, {"data": data, **samples}, MODES_MD, NEAR)
-    if not all(row.passes for row in rows):
-        raise SystemExit(1)
+        draw_plot(args.plot, {"data": data, **samples})
+    settings = {"steps": args.steps, "samples": args.samples, "seed": args.seed}
+    figures = {**settings, "cpu_s": seconds, "rows": [asdict(row) for row in rows]}
+    finish(args.json, figures, {f"{row.variant}, {row.word}": row.passes for row in rows})
+
+
+def plot(text: str) -> Path:
+    """Parse the path of a plot that can be written."""
+    path = writable(text)
+    if path.suffix.lower() not in PLOT_SUFFIXES:
+        raise argparse.ArgumentTypeError(f"{text!r} must end in {' or '.join(PLOT_SUFFIXES)}")
+    return path
 
 
 def train(variant: Variant, num_steps: int, seed: int) -> Toy:
@@ -179,7 +201,7 @@ def draw_samples(toy: Toy, sampler: str, num_samples: int, seed: int) -> dict[st
 
 def measure(variant: str, word: str, meant: tuple[float, float], points_ND: Tensor) -> Row:
     """Compare samples (N, 2) with the data's modes, and with the bars."""
-    near_MN = near_modes(points_ND, MODES_MD, NEAR)
+    near_MN = near_modes(points_ND)
     shares = near_MN.float().mean(dim=1).tolist()
     meant_modes = [m for m, share in enumerate(meant) if share]
     clouds = [points_ND[near_MN[m]] for m in meant_modes]
@@ -193,26 +215,29 @@ def measure(variant: str, word: str, meant: tuple[float, float], points_ND: Tens
     return Row(variant, word, meant, shares, mean_error, std_error, passes)
 
 
-def print_rows(rows: list[Row], cpu_s: dict[str, float]) -> None:
-    """Print a table, a row for each variant and word."""
-    header = [
-        "", "word", "left", "right", "error of means", "error of spreads", "bars", "CPU s",
-    ]  # fmt: skip
-    print_table(
-        header,
-        [
-            [
-                row.variant,
-                row.word,
-                *(f"{share:.1%}" for share in row.shares),
-                f"{row.mean_error:.3f}",
-                f"{row.std_error:.1%}",
-                "met" if row.passes else "missed",
-                f"{cpu_s[row.variant]:.1f}",
-            ]
-            for row in rows
-        ],
-    )
+def near_modes(points_ND: Tensor) -> Tensor:
+    """(M, N) bool: which points are near each mode."""
+    return torch.cdist(MODES_MD, points_ND) < NEAR
+
+
+def draw_plot(path: Path, columns: dict[str, dict[str, Tensor]]) -> None:
+    """Draw {column: {word: points (N, 2)}}, rings around the modes, and the share of the points in each."""
+    figure = Figure(figsize=(2.2 * len(columns), 2.3 * len(WORDS)), layout="constrained")
+    panels = figure.subplots(len(WORDS), len(columns), squeeze=False)
+    for name, clouds, panels_of_column in zip(columns, columns.values(), panels.T, strict=True):
+        panels_of_column[0].set_title(name)
+        for panel, points_ND in zip(panels_of_column, clouds.values(), strict=True):
+            panel.scatter(*points_ND.T, s=1, color="tab:gray" if name == "data" else "tab:blue")
+            shares = near_modes(points_ND).float().mean(dim=1).tolist()
+            for (x, y), share in zip(MODES_MD.tolist(), shares, strict=True):
+                panel.add_patch(Circle((x, y), NEAR, fill=False, color="tab:red"))
+                panel.text(x, -HALF_RANGE + 0.1, f"{share:.1%}", ha="center")
+            ends = -HALF_RANGE, HALF_RANGE
+            panel.set(xlim=ends, ylim=ends, xticks=[], yticks=[], aspect="equal")
+    for panel, word in zip(panels[:, 0], WORDS, strict=True):
+        panel.set_ylabel(f'"{word}"')
+    figure.suptitle(f"By the word (rows) and what was trained; shares: points within {NEAR:g} of a mode")
+    figure.savefig(path)
 
 
 if __name__ == "__main__":

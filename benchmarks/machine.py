@@ -1,4 +1,4 @@
-"""Parts of the benchmarks: an idle machine, time, tables that are also JSON, and bars."""
+"""Frame of the benchmarks: arguments, an idle machine, time, tables that are also JSON, and bars."""
 
 import argparse
 import json
@@ -20,10 +20,23 @@ def make_parser(doc: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
+def add_json_argument(parser: argparse.ArgumentParser) -> None:
+    """Declare --json."""
+    parser.add_argument("--json", type=writable, help="also write the figures to this file")
+
+
 def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare --json and --force."""
-    parser.add_argument("--json", type=writable, help="also write the figures to this file")
+    add_json_argument(parser)
     parser.add_argument("--force", action="store_true", help="measure on a busy machine all the same")
+
+
+def parse_on_idle_machine(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """Parse the command line, with --json and --force; exit with code 1 if the machine is busy."""
+    add_machine_arguments(parser)
+    args = parser.parse_args()
+    require_idle_machine(args.force)
+    return args
 
 
 def positive(text: str) -> int:
@@ -52,12 +65,15 @@ def require_idle_machine(force: bool) -> None:
         )
 
 
-def require_cuda(instead: str) -> None:
-    """Exit with code 1, saying what to do instead, if there is no CUDA device."""
+def device_name(device: str) -> str:
+    """Return the name of "cpu" or of the CUDA device; exit with code 1 if there is none."""
     import torch
 
-    if not torch.cuda.is_available():
-        raise SystemExit(f"No CUDA device is there; {instead}")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise SystemExit("No CUDA device is there; --device=cpu, or another benchmark, measures on a CPU.")
+    name = torch.cuda.get_device_name() if device == "cuda" else device
+    print(name, f"torch {torch.__version__}")
+    return name
 
 
 def milliseconds(call: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
@@ -80,15 +96,16 @@ def wait_and_time[T](call: Callable[[], T]) -> tuple[T, float]:
 
 
 def print_rows(title: str, figures: Rows) -> None:
-    """Print a table of rows of figures."""
+    """Print a table of rows of figures; one that a row lacks is a dash."""
     from lerobot_bomb.tables import print_table  # a peer's Python, which may run a script, lacks it
 
-    header = next(iter(figures.values()))
+    header = list(dict.fromkeys(name for row in figures.values() for name in row))
+    rows = [
+        [name, *(f"{row[column]:.2f}" if column in row else "-" for column in header)]
+        for name, row in figures.items()
+    ]
     print()
-    print_table(
-        [title, *(name.replace("_", " ") for name in header)],
-        [[name, *(f"{value:.2f}" for value in row.values())] for name, row in figures.items()],
-    )
+    print_table([title, *(column.replace("_", " ") for column in header)], rows)
 
 
 def write_figures(path: Path | None, figures: dict[str, Any]) -> None:
@@ -99,6 +116,6 @@ def write_figures(path: Path | None, figures: dict[str, Any]) -> None:
 
 def finish(path: Path | None, figures: dict[str, Any], bars: dict[str, bool]) -> None:
     """Print which bars hold, write the figures and exit, with code 1 if a bar is missed."""
-    print("\n".join(f"{'ok' if holds else 'MISSED'}: {bar}" for bar, holds in bars.items()))
+    print("", *(f"{'ok' if holds else 'MISSED'}: {bar}" for bar, holds in bars.items()), sep="\n")
     write_figures(path, {**figures, "bars": bars})
     sys.exit(0 if all(bars.values()) else 1)

@@ -11,7 +11,7 @@ resets stand beside those of gym-pusht itself, `bomb_libero`'s resets and steps 
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from statistics import median
 from typing import Any
@@ -20,12 +20,11 @@ import gymnasium
 import numpy as np
 from machine import (
     Rows,
-    add_machine_arguments,
     make_parser,
     milliseconds,
+    parse_on_idle_machine,
     positive,
     print_rows,
-    require_idle_machine,
     write_figures,
 )
 
@@ -53,33 +52,38 @@ LIBERO_SUITE, LIBERO_IMAGE_SIZE, STOCK = "libero_spatial", 256, "LeRobot's liber
 cpu_milliseconds = partial(milliseconds, clock=time.process_time)
 
 
-def conditions(axes: Any) -> list[str]:
-    """Return each axis at its highest level, then all axes together."""
-    return [*(f"{axis}:{MAX_LEVEL}" for axis in axes), ALL]
-
-
 def main() -> None:
     """Measure each axis at its highest level, print medians and ratios."""
     measures = {"bomb": measure_bomb, "bomb_pusht": measure_pusht, "bomb_libero": measure_libero}
     parser = make_parser(__doc__)
     parser.add_argument("--env.type", dest="env_type", choices=[*measures], default="bomb")
     parser.add_argument("--episodes", type=positive, default=60, help="of each condition (default: 60)")
-    add_machine_arguments(parser)
-    args = parser.parse_args()
-    require_idle_machine(args.force)
+    args = parse_on_idle_machine(parser)
     figures = measures[args.env_type](args.episodes)
     print_rows(f"{args.env_type}, {args.episodes} episodes; {TARGETS[args.env_type]}", figures)
     write_figures(args.json, {"episodes": args.episodes, "conditions": figures})
 
 
-def row(resets: list[float], stock_resets: list[float], steps: list[float], stock_steps: list[float]) -> dict:
-    """Return a condition's median milliseconds, each with its ratio to the stock median."""
-    times = {"reset": (median(resets), median(stock_resets)), "step": (median(steps), median(stock_steps))}
-    return {
-        f"{name}_{figure}": value
-        for name, (ms, stock_ms) in times.items()
-        for figure, value in {"ms": ms, "ratio": ms / stock_ms}.items()
-    }
+def conditions(axes: Any) -> list[str]:
+    """Return each axis at its highest level, then all axes together."""
+    return [*(f"{axis}:{MAX_LEVEL}" for axis in axes), ALL]
+
+
+@dataclass
+class Times:
+    """Milliseconds of the resets and the steps of one environment."""
+
+    resets: list[float] = field(default_factory=list)
+    steps: list[float] = field(default_factory=list)
+
+    def row(self, stock: "Times") -> dict[str, float]:
+        """Return the medians, each with its ratio to the stock median."""
+        figures = {}
+        for name in ("reset", "step"):
+            if times := getattr(self, f"{name}s"):
+                figures[f"{name}_ms"] = median(times)
+                figures[f"{name}_ratio"] = median(times) / median(getattr(stock, f"{name}s"))
+        return figures
 
 
 def seeded_actions(seed: int, num_dims: int) -> np.ndarray:
@@ -94,36 +98,34 @@ def measure_bomb(num_episodes: int) -> Rows:
         envs = [BombEnv(EpisodeSpec(0, perturbations=name), RenderOptions()) for name in (condition, NONE)]
         for env in envs:
             env.reset(seed=0)  # compiles the model, opens OpenGL
-        resets: list[list[float]] = [[], []]
-        steps: list[list[float]] = [[], []]
+        both = [(env, Times()) for env in envs]
         for seed in range(num_episodes):
-            for env, times in zip(envs, resets, strict=True):
-                times.append(milliseconds(partial(env.reset, seed=seed)))
+            for env, times in both:
+                times.resets.append(milliseconds(partial(env.reset, seed=seed)))
             for action in seeded_actions(seed, 4):
-                for env, times in zip(envs, steps, strict=True):
-                    times.append(milliseconds(partial(env.step, action)))
+                for env, times in both:
+                    times.steps.append(milliseconds(partial(env.step, action)))
         for env in envs:
             env.close()
-        figures[condition] = row(*resets, *steps)
+        (_, perturbed), (_, stock) = both
+        figures[condition] = perturbed.row(stock)
     return figures
 
 
 def measure_pusht(num_episodes: int) -> Rows:
     """Time the resets of each condition beside gym-pusht's own."""
     stock = gymnasium.make("gym_pusht:gym_pusht/PushT-v0", obs_type="pixels_agent_pos").unwrapped
-    names = [NONE, *conditions(PUSHT_AXES)]
-    envs = [make_pusht_env(PushTSpec(0, perturbations=name), IMAGE_SIZE).unwrapped for name in names]
-    for env in (stock, *envs):
+    envs = {"gym-pusht": stock} | {
+        name: make_pusht_env(PushTSpec(0, perturbations=name), IMAGE_SIZE).unwrapped
+        for name in [NONE, *conditions(PUSHT_AXES)]
+    }
+    for env in envs.values():
         env.reset(seed=0)
-    resets = [
-        [cpu_milliseconds(partial(env.reset, seed=seed)) for env in (stock, *envs)]
-        for seed in range(num_episodes)
-    ]
-    stock_ms, *ours_ms = map(median, zip(*resets, strict=True))
-    figures = {"gym-pusht": {"reset_ms": stock_ms, "reset_ratio": 1.0}}
-    for name, ms in zip(names, ours_ms, strict=True):
-        figures[name] = {"reset_ms": ms, "reset_ratio": ms / stock_ms}
-    return figures
+    times = {name: Times() for name in envs}
+    for seed in range(num_episodes):
+        for name, env in envs.items():
+            times[name].resets.append(cpu_milliseconds(partial(env.reset, seed=seed)))
+    return {name: each.row(times["gym-pusht"]) for name, each in times.items()}
 
 
 def measure_libero(num_episodes: int) -> Rows:
@@ -147,24 +149,22 @@ def measure_libero(num_episodes: int) -> Rows:
     }
     for env in (stock, *ours.values()):
         env.reset(seed=0)
-    names = [STOCK, NONE, *conditions(LIBERO_AXES)]
-    resets: Any = {name: [] for name in names}
-    steps: Any = {name: [] for name in names}
+    times = {name: Times() for name in [STOCK, NONE, *conditions(LIBERO_AXES)]}
     for seed in range(num_episodes):
-        for name in names:
+        for name, each in times.items():
             env: Any = stock
             if name == STOCK:
                 use_stock()
             else:
                 env = ours[NONE if name == NONE else ALL]
                 env._spec = replace(env._spec, perturbations=name)
-            resets[name].append(cpu_milliseconds(partial(env.reset, seed=seed)))
-            steps[name] += [cpu_milliseconds(partial(env.step, action)) for action in seeded_actions(seed, 7)]
+            each.resets.append(cpu_milliseconds(partial(env.reset, seed=seed)))
+            each.steps += [cpu_milliseconds(partial(env.step, action)) for action in seeded_actions(seed, 7)]
     for env in ours.values():
         env.close()
     use_stock()
     stock.close()
-    return {name: row(resets[name], resets[STOCK], steps[name], steps[STOCK]) for name in names}
+    return {name: each.row(times[STOCK]) for name, each in times.items()}
 
 
 if __name__ == "__main__":

@@ -17,14 +17,13 @@ import json
 import os
 import shutil
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
 
-from machine import add_machine_arguments, make_parser, positive, require_idle_machine, write_figures
-from pusht_offline import convert, evaluate, max_coverages, run_logged
+from machine import make_parser, parse_on_idle_machine, positive, write_figures
+from pusht_commands import convert, evaluate, train
 from pusht_report import over_episodes
 from recipes import FOLDER, last_checkpoint, read_recipe, recipe_path
 
@@ -36,18 +35,6 @@ CALIBRATION_STEPS = {"cpu": (5, 35), "cuda": (100, 400)}
 # of a batch that fills a GPU, read by processes of their own
 ON = {"cpu": ["--num_workers=0"], "cuda": ["--num_workers=2", "--batch_size=128"]}
 POLICIES = sorted(path.stem.removeprefix("play_pusht_") for path in FOLDER.glob("play_pusht_*.yaml"))
-
-
-@dataclass(frozen=True)
-class Seconds:
-    """Seconds that a training took, by the clock and of CPU."""
-
-    clock: float
-    cpu: float
-
-    def on(self, device: str) -> float:
-        """Return the seconds that count on a device: of CPU on a CPU, else by the clock."""
-        return self.cpu if device == "cpu" else self.clock
 
 
 @dataclass(frozen=True)
@@ -72,9 +59,7 @@ def main() -> None:
     parser.add_argument("--policies", nargs="+", choices=POLICIES, default=POLICIES)
     parser.add_argument("--jobs", type=positive, default=1, help="trainings at once (default: 1)")
     parser.add_argument("--episodes", type=positive, default=100, help="of each evaluation (default: 100)")
-    add_machine_arguments(parser)
-    args = parser.parse_args()
-    require_idle_machine(args.force)
+    args = parse_on_idle_machine(parser)
     os.environ["OMP_NUM_THREADS"] = "1"
     try:
         dataset = convert(args.source, args.output_dir / "dataset", COPIES)
@@ -94,13 +79,25 @@ def compete(args: argparse.Namespace, name: str, dataset: Path) -> Contender:
     if not times_path.exists():
         shutil.rmtree(folder, ignore_errors=True)
         steps = max(1, int(60 * args.minutes / step_s(folder, flags, args.device)))
-        seconds = train(folder / "train", [*flags, *decay(name, steps)], steps)
-        minutes = {"minutes": seconds.clock / 60, "cpu_minutes": seconds.cpu / 60}
-        times_path.write_text(json.dumps({"steps": steps, **minutes}) + "\n")
-    coverages, num_successes = coverages_of(folder, args.episodes)
+        seconds = train(folder / "train", [*flags, *decay(name, steps), *steps_flags(steps)])
+        times_path.write_text(json.dumps({"steps": steps, **seconds.minutes()}) + "\n")
+    coverages, num_successes = evaluate(
+        last_checkpoint(folder / "train"),
+        folder / f"eval_{args.episodes}",
+        [
+            f"--seed={FIRST_UNSEEN_SEED}",
+            f"--eval.n_episodes={args.episodes}",
+            f"--eval.batch_size={min(50, args.episodes)}",
+        ],
+    )
     return Contender(
         name, max_coverages=coverages, num_successes=num_successes, **json.loads(times_path.read_text())
     )
+
+
+def steps_flags(steps: int) -> list[str]:
+    """Return the flags of a training of so many steps with three checkpoints."""
+    return [f"--steps={steps}", f"--save_freq={-(-steps // 3)}"]
 
 
 def decay(name: str, steps: int) -> list[str]:
@@ -112,31 +109,10 @@ def decay(name: str, steps: int) -> list[str]:
 def step_s(folder: Path, flags: list[str], device: str) -> float:
     """Return the seconds of a training step, CPU seconds on a CPU: what each further step takes."""
     few, more = CALIBRATION_STEPS[device]
-    shorter, longer = (train(folder / f"calibration_{steps}", flags, steps) for steps in (few, more))
-    return (longer.on(device) - shorter.on(device)) / (more - few)
-
-
-def train(output_dir: Path, flags: list[str], steps: int) -> Seconds:
-    """Run stock `lerobot-train`; return the seconds that it took."""
-    started = time.monotonic()
-    cpu = run_logged(
-        output_dir.with_suffix(".log"),
-        "lerobot-train",
-        *flags,
-        f"--output_dir={output_dir}",
-        f"--steps={steps}",
-        f"--save_freq={-(-steps // 3)}",
+    shorter, longer = (
+        train(folder / f"calibration_{steps}", [*flags, *steps_flags(steps)]) for steps in (few, more)
     )
-    return Seconds(time.monotonic() - started, cpu)
-
-
-def coverages_of(folder: Path, episodes: int) -> tuple[list[float], int]:
-    """Return the maximal coverage of each episode, and the number of successes."""
-    checkpoint = last_checkpoint(folder / "train")
-    flags = [f"--seed={FIRST_UNSEEN_SEED}", f"--eval.n_episodes={episodes}"]
-    flags.append(f"--eval.batch_size={min(50, episodes)}")
-    metrics = evaluate(checkpoint, folder / f"eval_{episodes}", flags)
-    return max_coverages(metrics), sum(sum(each["successes"]) for each in metrics)
+    return (longer.on(device) - shorter.on(device)) / (more - few)
 
 
 def print_contenders(contenders: list[Contender]) -> None:

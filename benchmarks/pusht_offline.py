@@ -19,23 +19,18 @@ import argparse
 import json
 import os
 import shutil
-import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from machine import make_parser, positive, write_figures
+from machine import add_json_argument, make_parser, positive, write_figures
+from pusht_commands import REPO_ID, convert, evaluate, run_logged, train
 from pusht_report import Seed, print_report
 from recipes import PUSHT_TYPES, last_checkpoint, recipe_path
 
-from lerobot_bomb.commands.run import run_command
-
-REPO_ID = "lerobot_bomb/pusht"
 NUM_TRAIN_EPISODES = 180
-MAX_COVERAGE_REWARD = 0.95  # coverage from which gym-pusht's reward is 1
 
 # absolute positions that no state tells must be found in the image; the near ones are found first
 LOOK_FLAGS = ["--policy.use_state=false", "--policy.optimizer_lr=1.0e-3"]
@@ -53,15 +48,8 @@ BASE_STAGES: dict[str, list[list[str]]] = {
 }
 RECIPE = "recipe"
 VARIANTS: dict[str, dict[str, list[str]]] = {
-    "fdvla": {
-        RECIPE: [],
-        "flow_only": ["--policy.use_denoise_head=false"],
-        "diffusion_only": ["--policy.use_flow_head=false"],
-    },
-    "spatialvla_grid": {
-        RECIPE: [],
-        "uniform": ["--policy.grid_distribution=uniform"],
-    },
+    "fdvla": {RECIPE: []},
+    "spatialvla_grid": {RECIPE: []},
     "vla0_smol": {
         RECIPE: [],
         "no_masking": ["--policy.mask_max_fraction=0"],
@@ -69,32 +57,6 @@ VARIANTS: dict[str, dict[str, list[str]]] = {
         "no_state": ["--policy.use_state=false"],
     },
 }
-
-
-@dataclass(frozen=True)
-class Run:
-    """One training: a variant of the recipe and a seed."""
-
-    variant: str
-    seed: int
-    folder: Path
-
-    @property
-    def train_dir(self) -> Path:
-        return self.folder / "train"
-
-    @property
-    def checkpoint(self) -> Path:
-        return last_checkpoint(self.train_dir)
-
-    @property
-    def times_path(self) -> Path:
-        """File that is written when the training is complete."""
-        return self.folder / "training.json"
-
-    def times(self) -> dict[str, float]:
-        """Return the training's wall-clock and CPU minutes."""
-        return json.loads(self.times_path.read_text())
 
 
 def main() -> None:
@@ -108,7 +70,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=positive, default=2, help="trainings at once (default: 2)")
     parser.add_argument("--frames", type=positive, default=1000, help="held-out frames (default: 1000)")
     parser.add_argument("--eval_episodes", type=positive, help="episodes in the environment, each seed")
-    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    add_json_argument(parser)
     args = parser.parse_args()
     known = VARIANTS[args.policy_type]
     if unknown := set(args.variants or ()) - set(known):
@@ -120,7 +82,8 @@ def main() -> None:
         sys.exit(f"pusht_offline.py: {error}")
     print(f"\n{args.policy_type}, episodes {NUM_TRAIN_EPISODES}-205, {args.seeds} seeds")
     beaten = print_report(variants, RECIPE)
-    write_figures(args.json, {"policy": args.policy_type, "variants": as_figures(variants)})
+    figures = {name: [asdict(seed) for seed in seeds] for name, seeds in variants.items()}
+    write_figures(args.json, {"policy": args.policy_type, "variants": figures})
     sys.exit(0 if beaten else 1)
 
 
@@ -128,137 +91,77 @@ def prove(args: argparse.Namespace, chosen: list[str]) -> dict[str, list[Seed]]:
     """Train and measure the chosen variants, {variant: one `Seed` for each seed}."""
     dataset = convert(args.source, args.output_dir / "dataset")
     start = learn_to_see(args.policy_type, dataset, args.output_dir)
-    runs = [
-        Run(variant, seed, args.output_dir / f"{variant}_{seed}")
-        for seed in range(args.seeds)
-        for variant in chosen
-    ]
 
-    def prove_one(run: Run) -> Seed:
-        train(run, args.policy_type, dataset, [*start, *VARIANTS[args.policy_type][run.variant]])
-        columns = measure(run, dataset, args.frames)
-        num_episodes = args.eval_episodes if run.variant == RECIPE else None
-        coverages = [] if num_episodes is None else coverages_of(run, num_episodes)
-        return Seed(columns["train"], columns["validation"], max_coverages=coverages, **run.times())
+    def prove_one(variant: str, number: int) -> Seed:
+        folder = args.output_dir / f"{variant}_{number}"
+        flags = [f"--seed={number}", *start, *VARIANTS[args.policy_type][variant]]
+        checkpoint, minutes = train_once(folder, args.policy_type, dataset, flags)
+        validation = measure(checkpoint, folder, dataset, args.frames)["validation"]
+        coverages: list[float] = []
+        if args.eval_episodes and variant == RECIPE:
+            flags = [f"--eval.n_episodes={args.eval_episodes}", "--eval.batch_size=10"]
+            coverages, _ = evaluate(checkpoint, folder / f"eval_{args.eval_episodes}", flags)
+        return Seed(validation, max_coverages=coverages, **minutes)
 
-    variants: dict[str, list[Seed]] = {}
     with ThreadPoolExecutor(args.jobs) as pool:
-        for run, seed in zip(runs, pool.map(prove_one, runs), strict=True):
-            variants.setdefault(run.variant, []).append(seed)
-    return variants
-
-
-def as_figures(variants: dict[str, list[Seed]]) -> dict[str, list[dict[str, Any]]]:
-    """Return the figures ready for JSON."""
-    return {name: [asdict(seed) for seed in seeds] for name, seeds in variants.items()}
-
-
-def convert(source: Path | None, dataset: Path, copies: int = 0) -> Path:
-    """Convert the demonstrations, and so many rigid copies of each, to a LeRobotDataset in a folder."""
-    if not dataset.exists():
-        if source is None:
-            raise RuntimeError(f"{dataset} does not exist yet; name the demonstrations with --source")
-        resume = ["--resume"] if dataset.with_name(f"{dataset.name}.conversion").exists() else []
-        flags = [f"--repo_id={REPO_ID}", f"--root={dataset}", f"--copies={copies}", *resume]
-        run_command("lerobot-bomb", "convert", "pusht-zarr", str(source), *flags)
-    return dataset
+        # seed by seed, so that each variant has been trained once first
+        runs = {
+            (variant, number): pool.submit(prove_one, variant, number)
+            for number in range(args.seeds)
+            for variant in chosen
+        }
+        return {
+            variant: [runs[variant, number].result() for number in range(args.seeds)] for variant in chosen
+        }
 
 
 def learn_to_see(policy_type: str, dataset: Path, folder: Path) -> list[str]:
     """Train a backbone to see; return the flags that start a training from it."""
     start: list[str] = []
     for stage, flags in enumerate(BASE_STAGES[policy_type]):
-        run = Run("base", 0, folder / f"base_{stage}")
-        train(run, policy_type, dataset, [*flags, *start])
-        backbone = run.folder / "backbone"
+        stage_dir = folder / f"base_{stage}"
+        checkpoint, _ = train_once(stage_dir, policy_type, dataset, ["--seed=0", *flags, *start])
+        backbone = stage_dir / "backbone"
         if not backbone.exists():
-            export = [f"--policy.path={run.checkpoint}", f"--output={backbone}"]
-            run_logged(run.folder / "export.log", "lerobot-bomb", "checkpoint", "export-backbone", *export)
+            export = [f"--policy.path={checkpoint}", f"--output={backbone}"]
+            run_logged(stage_dir / "export.log", "lerobot-bomb", "checkpoint", "export-backbone", *export)
         start = [f"--policy.vlm_model_name={backbone.resolve()}"]
     return start
 
 
-def train(run: Run, policy_type: str, dataset: Path, flags: list[str]) -> None:
-    """Run stock `lerobot-train`; a training that was killed starts anew."""
-    if run.times_path.exists():
-        return
-    shutil.rmtree(run.folder, ignore_errors=True)
-    started = time.monotonic()
-    cpu_s = run_logged(
-        run.folder / "train.log",
-        "lerobot-train",
-        f"--config_path={recipe_path('pusht', policy_type)}",
-        f"--dataset.repo_id={REPO_ID}",
-        f"--dataset.root={dataset}",
-        f"--dataset.episodes={list(range(NUM_TRAIN_EPISODES))}",
-        f"--output_dir={run.train_dir}",
-        f"--seed={run.seed}",
-        *flags,
-    )
-    minutes = {"minutes": (time.monotonic() - started) / 60, "cpu_minutes": cpu_s / 60}
-    run.times_path.write_text(json.dumps(minutes) + "\n")
+def train_once(
+    folder: Path, policy_type: str, dataset: Path, flags: list[str]
+) -> tuple[Path, dict[str, float]]:
+    """Train unless that is done; return the checkpoint and the minutes. A killed training starts anew."""
+    times_path = folder / "training.json"
+    if not times_path.exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        data = [
+            f"--dataset.repo_id={REPO_ID}",
+            f"--dataset.root={dataset}",
+            f"--dataset.episodes={list(range(NUM_TRAIN_EPISODES))}",
+        ]
+        seconds = train(
+            folder / "train", [f"--config_path={recipe_path('pusht', policy_type)}", *data, *flags]
+        )
+        times_path.write_text(json.dumps(seconds.minutes()) + "\n")
+    return last_checkpoint(folder / "train"), json.loads(times_path.read_text())
 
 
-def measure(run: Run, dataset: Path, num_frames: int) -> dict[str, Any]:
+def measure(checkpoint: Path, folder: Path, dataset: Path, num_frames: int) -> dict[str, Any]:
     """Measure with `lerobot-bomb checkpoint offline-metrics` on the episodes that were not trained on."""
-    path = run.folder / f"metrics_{num_frames}.json"
+    path = folder / f"metrics_{num_frames}.json"
     if not path.exists():
-        run_logged(
-            run.folder / "metrics.log",
-            "lerobot-bomb",
-            "checkpoint",
-            "offline-metrics",
-            f"--policy.path={run.checkpoint}",
+        flags = [
+            f"--policy.path={checkpoint}",
             f"--dataset.repo_id={REPO_ID}",
             f"--dataset.root={dataset}",
             f"--max_frames={num_frames}",
             "--batch_size=64",
             f"--json={path}",
-        )
+        ]
+        run_logged(folder / "metrics.log", "lerobot-bomb", "checkpoint", "offline-metrics", *flags)
     return json.loads(path.read_text())["columns"]
-
-
-def coverages_of(run: Run, num_episodes: int) -> list[float]:
-    """Return the maximal coverage of each episode."""
-    flags = [f"--eval.n_episodes={num_episodes}", "--eval.batch_size=10"]
-    return max_coverages(evaluate(run.checkpoint, run.folder / f"eval_{num_episodes}", flags))
-
-
-def evaluate(checkpoint: Path, output_dir: Path, flags: list[str]) -> list[dict[str, Any]]:
-    """Run stock `lerobot-eval --env.type=pusht`; return the metrics of each task."""
-    info = output_dir / "eval_info.json"
-    if not info.exists():
-        shutil.rmtree(output_dir, ignore_errors=True)
-        run_logged(
-            output_dir.with_name("eval.log"),
-            "lerobot-eval",
-            f"--policy.path={checkpoint}",
-            "--env.type=pusht",
-            *flags,
-            "--eval.use_async_envs=false",
-            f"--output_dir={output_dir}",
-        )
-    return [task["metrics"] for task in json.loads(info.read_text())["per_task"]]
-
-
-def max_coverages(metrics: list[dict[str, Any]]) -> list[float]:
-    """Return the largest coverage of each episode, from gym-pusht's rewards."""
-    return [MAX_COVERAGE_REWARD * reward for each in metrics for reward in each["max_rewards"]]
-
-
-def run_logged(log: Path, command: str, *flags: str) -> float:
-    """Run a command of this Python's environment, log its output; return its processes' CPU seconds."""
-    log.parent.mkdir(parents=True, exist_ok=True)
-    print(f"{log.parent.name}: {command} {' '.join(flags[:2])} ... > {log}", flush=True)
-    with log.open("w") as output:
-        process = subprocess.Popen(
-            [Path(sys.executable).with_name(command), *flags], stdout=output, stderr=output
-        )
-        _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise RuntimeError(f"`{command}` ended with exit code {process.returncode}; see {log}")
-    return usage.ru_utime + usage.ru_stime
 
 
 if __name__ == "__main__":

@@ -7,20 +7,19 @@ from statistics import fmean, stdev
 from typing import Any
 
 import numpy as np
+from scipy.stats import t
 
 from lerobot_bomb.bootstrap import bootstrap_interval
 from lerobot_bomb.tables import print_table
 
-T_QUANTILES = {2: 12.706, 3: 4.303, 4: 3.182, 5: 2.776}  # 97.5 % of Student's t, by number of seeds
 SHOWN_STEPS = (1, 2, 3, 5, 8, 10, 12, 16)  # of the chunk
 POLICY = "policy"
 
 
 @dataclass(frozen=True)
 class Seed:
-    """One training: its two columns of `checkpoint offline-metrics`, time, coverages."""
+    """One training: its validation column of `checkpoint offline-metrics`, time, coverages."""
 
-    train: dict[str, Any]
     validation: dict[str, Any]
     minutes: float
     cpu_minutes: float
@@ -33,31 +32,19 @@ class Seed:
     def l1_by_step(self, predictor: str = POLICY) -> list[float]:
         return [step["mean"] for step in self.validation["l1"][predictor]["steps"]]
 
-    def loss(self, name: str) -> float:
-        return self.validation["losses"][name]["mean"]
-
 
 def print_report(variants: dict[str, list[Seed]], recipe: str) -> bool:
     """Print the tables; return True if every seed of the recipe has a smaller L1 than all predictors."""
-    names = [
-        name
-        for name in ("loss", "token_accuracy", "value_accuracy")
-        if name in _any(variants).validation["losses"]
-    ]
     rows = [
         [
             name,
             over_seeds([seed.l1() for seed in seeds]),
-            over_seeds([seed.train["l1"][POLICY]["all"]["mean"] for seed in seeds]),
-            *(over_seeds([seed.loss(loss) for seed in seeds]) for loss in names),
             f"{fmean(seed.minutes for seed in seeds):.1f}",
             f"{fmean(seed.cpu_minutes for seed in seeds):.1f}",
         ]
         for name, seeds in variants.items()
     ]
-    print_table(
-        ["mean [95 % t over seeds]", "L1 held out, px", "L1 train, px", *names, "minutes", "CPU min"], rows
-    )
+    print_table(["mean [95 % t over seeds]", "L1 held out, px", "minutes", "CPU min"], rows)
     _print_steps(variants)
     for number, seed in enumerate(variants.get(recipe, [])):
         if seed.max_coverages:
@@ -68,9 +55,9 @@ def print_report(variants: dict[str, list[Seed]], recipe: str) -> bool:
 def over_seeds(values: Sequence[float]) -> str:
     """Format the mean, with its t-interval if there are several values."""
     mean, precision = fmean(values), 3 if abs(fmean(values)) < 3 else 1
-    if len(values) not in T_QUANTILES:
+    if len(values) == 1:
         return f"{mean:.{precision}f}"
-    half = T_QUANTILES[len(values)] * stdev(values) / sqrt(len(values))
+    half = t.ppf(0.975, len(values) - 1) * stdev(values) / sqrt(len(values))
     return f"{mean:.{precision}f} [{mean - half:.{precision}f}, {mean + half:.{precision}f}]"
 
 
@@ -83,7 +70,7 @@ def over_episodes(values: Sequence[float]) -> str:
 
 def _print_steps(variants: dict[str, list[Seed]]) -> None:
     """Print L1 by step of the chunk, of each variant (mean over seeds) and each trivial predictor."""
-    first = _any(variants)
+    first, *_ = next(iter(variants.values()))
     rows = {
         name: (fmean(seed.l1() for seed in seeds), np.mean([seed.l1_by_step() for seed in seeds], axis=0))
         for name, seeds in variants.items()
@@ -111,7 +98,3 @@ def _is_beaten(seeds: list[Seed]) -> bool:
         f"\nbest trivial predictor: {best[1]} with {best[0]:.1f} px, {verdict} (worst: {worst_seed:.1f} px)"
     )
     return worst_seed < best[0]
-
-
-def _any(variants: dict[str, list[Seed]]) -> Seed:
-    return next(iter(variants.values()))[0]

@@ -15,15 +15,7 @@ from typing import Any
 import torch
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
-from machine import (
-    add_machine_arguments,
-    make_parser,
-    milliseconds,
-    positive,
-    print_rows,
-    require_idle_machine,
-    write_figures,
-)
+from machine import make_parser, milliseconds, parse_on_idle_machine, positive, print_rows, write_figures
 
 from lerobot_bomb.compat.hooks.datasets import keep_frames_in_memory
 from lerobot_bomb.data.kept_frames import keep_frames
@@ -37,9 +29,7 @@ def main() -> None:
     parser.add_argument("--dataset.repo_id", dest="repo_id", required=True)
     parser.add_argument("--dataset.root", dest="root", type=Path, required=True)
     parser.add_argument("--samples", type=positive, default=300)
-    add_machine_arguments(parser)
-    args = parser.parse_args()
-    require_idle_machine(args.force)
+    args = parse_on_idle_machine(parser)
     times = {ACTION: [step / LeRobotDatasetMetadata(args.repo_id, args.root).fps for step in range(CHUNK)]}
     stock = LeRobotDataset(args.repo_id, args.root, delta_timestamps=times)
     keep_frames_in_memory(keep_frames)

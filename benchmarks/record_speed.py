@@ -13,13 +13,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from machine import add_machine_arguments, make_parser, require_idle_machine, write_figures
+from machine import make_parser, parse_on_idle_machine, positive, print_rows, write_figures
 
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.rollout_pool import Rollout, RolloutSettings, collect
 from lerobot_bomb.envs.rollout import make_env
-from lerobot_bomb.tables import print_table
 
 TARGET = 0.8  # of the peer's frames per second
 RECORDER, PEER = "lerobot-bomb record", "LeRobot's streaming writer"
@@ -29,14 +28,9 @@ ONE_THREAD, H264 = f"{PEER}, 1 encoder thread", f"{PEER}, h264"
 def main() -> None:
     """Measure in turn, print medians and ratios."""
     parser = make_parser(__doc__)
-    parser.add_argument("--episodes", type=int, default=60, help="episodes in each run (default: 60)")
-    parser.add_argument("--repeats", type=int, default=3, help="runs of each writer (default: 3)")
-    parser.add_argument(
-        "--workers", type=int, default=1, help="the recorder's simulator processes (default: 1)"
-    )
-    add_machine_arguments(parser)
-    args = parser.parse_args()
-    require_idle_machine(args.force)
+    parser.add_argument("--episodes", type=positive, default=60, help="in each run (default: 60)")
+    parser.add_argument("--repeats", type=positive, default=3, help="runs of each writer (default: 3)")
+    args = parse_on_idle_machine(parser)
 
     # not at the top: the recorder's workers import this file's head and would load torch
     importlib.import_module("lerobot_bomb.data.blocks")
@@ -52,20 +46,20 @@ def main() -> None:
                 root = Path(folder) / "dataset"
                 started = time.perf_counter()
                 if name == RECORDER:
-                    record(recording, root, num_workers=args.workers)
+                    record(recording, root, num_workers=1)
                 else:
                     write_with_lerobot(recording, root, rollouts, name)
                 runs.append(time.perf_counter() - started)
 
     frames_per_s = {name: num_frames / statistics.median(runs) for name, runs in seconds.items()}
-    ratio = frames_per_s[RECORDER] / frames_per_s[PEER]
-    rows = [[n, f"{fps:.1f}", f"{fps / frames_per_s[PEER]:.2f}"] for n, fps in frames_per_s.items()]
-    print(f"{len(rollouts)} episodes, {num_frames} frames of 2 cameras, median of {args.repeats} runs")
-    print_table(["", "frames/s", "ratio"], rows)
+    rows = {
+        name: {"frames_per_s": fps, "ratio": fps / frames_per_s[PEER]} for name, fps in frames_per_s.items()
+    }
+    print_rows(f"{len(rollouts)} episodes, {num_frames} frames of 2 cameras, {args.repeats} runs", rows)
+    ratio = rows[RECORDER]["ratio"]
     print(f"target: a ratio of at least {TARGET}: {'reached' if ratio >= TARGET else 'missed'}")
-    write_figures(
-        args.json, {"frames": num_frames, "frames_per_s": frames_per_s, "ratio": ratio, "target": TARGET}
-    )
+    figures = {"frames": num_frames, "frames_per_s": frames_per_s, "ratio": ratio, "target": TARGET}
+    write_figures(args.json, figures)
 
 
 def successes(recording: Recording) -> list[Rollout]:

@@ -22,7 +22,16 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from machine import add_machine_arguments, finish, make_parser, milliseconds, require_idle_machine
+from machine import (
+    Rows,
+    add_machine_arguments,
+    finish,
+    make_parser,
+    milliseconds,
+    positive,
+    print_rows,
+    require_idle_machine,
+)
 
 IMAGE_SIZE = 256
 NUM_FRAMES = 100
@@ -37,7 +46,7 @@ WORKERS_BAR, START_BAR_S = 1.8, 1.5
 def main() -> None:
     """Measure in turn, print medians, ratios and targets."""
     parser = make_parser(__doc__)
-    parser.add_argument("--repeats", type=int, default=3, help="processes of each environment (default: 3)")
+    parser.add_argument("--repeats", type=positive, default=3, help="processes of each (default: 3)")
     parser.add_argument("--robosuite_python", default=sys.executable, help="a Python that has robosuite")
     parser.add_argument("--measure", choices=MEASURES, help=argparse.SUPPRESS)
     add_machine_arguments(parser)
@@ -63,7 +72,7 @@ def main() -> None:
     finish(args.json, figures, bars(figures))
 
 
-def compare_environments(repeats: int, robosuite_python: str) -> dict[str, dict[str, float]]:
+def compare_environments(repeats: int, robosuite_python: str) -> Rows:
     """Return {environment: {"frame" or "step": median milliseconds}}; an absent peer is left out."""
     pythons = dict.fromkeys(MEASURES, sys.executable) | {"lift": robosuite_python}
     runs: dict[str, list[dict[str, float]]] = {name: [] for name in pythons}
@@ -207,18 +216,15 @@ def start_seconds(path: str, repeats: int) -> float:
 
 def report(figures: dict) -> None:
     """Print what was measured."""
-    from lerobot_bomb.tables import print_table  # robosuite's Python, which runs this file too, lacks it
-
-    rows = []
-    for name in MEASURES:
-        measured = figures["milliseconds"].get(name, {})
-        rows.append([name, *(f"{measured[k]:.2f}" if k in measured else "-" for k in ("frame", "step"))])
-    print_table(["milliseconds", "frame", "step + 2 cameras"], rows)
-    if "lift" not in figures["milliseconds"]:
+    milliseconds_of = figures["milliseconds"]
+    print_rows(
+        "milliseconds; a step has 2 cameras", {name: milliseconds_of.get(name, {}) for name in MEASURES}
+    )
+    if "lift" not in milliseconds_of:
         print("lift was not measured; see --help for how to install robosuite")
     rate, start = figures["steps_per_s"], figures["start_s"]
     print(f"steps/s with two cameras: {rate['1']:.0f} in one process, {rate['2']:.0f} in two")
-    print(f"start of two workers: ours {start['ours']:.2f} s, LeRobot's default {start['default']:.2f} s\n")
+    print(f"start of two workers: ours {start['ours']:.2f} s, LeRobot's default {start['default']:.2f} s")
 
 
 def bars(figures: dict) -> dict[str, bool]:

@@ -21,12 +21,11 @@ from lerobot.datasets.factory import make_dataset
 from lerobot.envs import make_env, make_env_config, make_env_pre_post_processors, preprocess_observation
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
-from machine import add_machine_arguments, make_parser, positive, require_idle_machine, write_figures
+from machine import make_parser, parse_on_idle_machine, positive, write_figures
 from overfit import IMAGE_SIZE, record
 from recipes import POLICY_TYPES, read_recipe
 from torch.utils.data import default_collate
 
-from lerobot_bomb.policies.config import DTYPES
 from lerobot_bomb.tables import print_table
 
 
@@ -50,19 +49,13 @@ def main() -> None:
     """Profile both steps and print where their time goes."""
     parser = make_parser(__doc__)
     parser.add_argument("--policy.type", dest="policy_type", required=True, choices=POLICY_TYPES)
-    parser.add_argument(
-        "--policy.dtype", dest="dtype", choices=DTYPES, default="float32", help="default: float32"
-    )
-    parser.add_argument(
-        "--repeats", type=positive, default=20, help="training steps and predictions (default: 20)"
-    )
-    add_machine_arguments(parser)
-    args = parser.parse_args()
-    require_idle_machine(args.force)
+    steps = "training steps and predictions (default: 20)"
+    parser.add_argument("--repeats", type=positive, default=20, help=steps)
+    args = parse_on_idle_machine(parser)
     register_third_party_plugins()
     with tempfile.TemporaryDirectory() as folder:
         record(Path(folder) / "dataset")
-        cfg = recipe(args.policy_type, Path(folder) / "dataset", args.dtype)
+        cfg = recipe(args.policy_type, Path(folder) / "dataset")
         dataset: Any = make_dataset(cfg)
     assert cfg.policy is not None
     torch.manual_seed(0)
@@ -73,14 +66,13 @@ def main() -> None:
     train = profile_training(cfg, policy, processors[0], dataset, args.repeats)
     print("\nevaluation step, batch of 1")
     evaluation = profile_evaluation(cfg, policy, processors, args.repeats)
-    names = {"policy": args.policy_type, "dtype": args.dtype}
-    write_figures(args.json, {**names, "training_ms": train, "evaluation_ms": evaluation})
+    figures = {"policy": args.policy_type, "training_ms": train, "evaluation_ms": evaluation}
+    write_figures(args.json, figures)
 
 
-def recipe(policy_type: str, dataset: Path, dtype: str = "float32") -> TrainPipelineConfig:
+def recipe(policy_type: str, dataset: Path) -> TrainPipelineConfig:
     """Read configs/overfit_TYPE.yaml for this dataset, as `lerobot-train` does."""
     values = read_recipe("overfit", policy_type)
-    values["policy"]["dtype"] = dtype
     values["dataset"] |= {"root": str(dataset), "video_backend": "pyav"}
     return draccus.decode(TrainPipelineConfig, values)
 

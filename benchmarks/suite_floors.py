@@ -12,10 +12,9 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
-from machine import make_parser, positive, write_figures
+from machine import add_json_argument, make_parser, positive, print_rows, write_figures
 
 from lerobot_bomb.bomb.board import COLORS, Intersection
 from lerobot_bomb.bomb.commands import Case, Stones, Task, TaskInstance, draw_command
@@ -28,7 +27,6 @@ from lerobot_bomb.bomb.suites import long as long_suite
 from lerobot_bomb.bomb.suites import object as object_suite
 from lerobot_bomb.bomb.suites import spatial as spatial_suite
 from lerobot_bomb.bomb.suites.place import ALL_TARGETS
-from lerobot_bomb.tables import print_table
 
 FIRST_SEED = 100_000
 KNOWN_SEEDS = range(5000)  # from which the most likely place is known
@@ -43,15 +41,12 @@ def main() -> None:
     """Print a row for each suite; chances in per cent."""
     parser = make_parser(__doc__)
     parser.add_argument("--episodes", type=positive, default=2000, help="of each suite (default: 2000)")
-    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    add_json_argument(parser)
     args = parser.parse_args()
     seeds = range(FIRST_SEED, FIRST_SEED + args.episodes)
     figures = {suite: floors_of(suite)(seeds) for suite in SUITES}
-    names = list(next(iter(figures.values())))
-    print_table(
-        [f"{args.episodes} episodes, %", *names],
-        [[suite, *(f"{100 * row[name]:.1f}" for name in names)] for suite, row in figures.items()],
-    )
+    percent = {suite: {name: 100 * rate for name, rate in row.items()} for suite, row in figures.items()}
+    print_rows(f"{args.episodes} episodes, %", percent)
     write_figures(args.json, figures)
 
 

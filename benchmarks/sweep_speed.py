@@ -16,12 +16,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from machine import add_machine_arguments, make_parser, positive, require_idle_machine, write_figures
+from machine import make_parser, parse_on_idle_machine, positive, print_rows, write_figures
 
 from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.results.record import Record, without_measured
 from lerobot_bomb.sweep.manifest import Manifest, plan
-from lerobot_bomb.tables import print_table
 
 FLAGS = ("--env.type=bomb", "--env.image_size=64", "--policy.device=cpu")
 SEED = 1000
@@ -38,9 +37,7 @@ def main() -> None:
     add("--conditions", default="none,camera:3,light:3,table:3,start:3,language:3", help="joined by commas")
     add("--episodes", type=positive, default=20, help="of each job (default: 20)")
     add("--batch_size", type=positive, default=10, help="default: 10")
-    add_machine_arguments(parser)
-    args = parser.parse_args()
-    require_idle_machine(args.force)
+    args = parse_on_idle_machine(parser)
     conditions = args.conditions.split(",")
     manifest = plan([args.policy], ["place"], conditions, SEED, args.episodes, args.batch_size, FLAGS)
 
@@ -61,8 +58,10 @@ def main() -> None:
             raise SystemExit(f"{name} gives other records than {EACH}")
 
     title = f"{args.policy}, {len(conditions)} conditions of {args.episodes} episodes"
-    rows = [[name, f"{value:.0f}", f"{value / hourly[EACH]:.2f}"] for name, value in hourly.items()]
-    print_table([title, "episodes an hour", "ratio"], rows)
+    rows = {
+        name: {"episodes_an_hour": value, "ratio": value / hourly[EACH]} for name, value in hourly.items()
+    }
+    print_rows(title, rows)
     for name, (peer, target) in TARGETS.items():
         ratio = hourly[name] / hourly[peer]
         print(f"{name}: {ratio:.2f} times {peer} (target: {target})")

@@ -8,14 +8,11 @@ def column(policy: float, repeat: float) -> dict[str, Any]:
     def l1(mean: float) -> dict[str, Any]:
         return {"all": {"mean": mean}, "steps": [{"mean": mean - 1}, {"mean": mean + 1}]}
 
-    return {
-        "losses": {"loss": {"mean": 0.5}},
-        "l1": {"policy": l1(policy), "repeat": l1(repeat), "mean": l1(80)},
-    }
+    return {"l1": {"policy": l1(policy), "repeat": l1(repeat), "mean": l1(80)}}
 
 
 def seeds(*policy_l1: float) -> list[Seed]:
-    return [Seed(column(20.0, 30.0), column(l1, 30.0), 10.0, 15.0, [0.25, 0.75]) for l1 in policy_l1]
+    return [Seed(column(l1, 30.0), 10.0, 15.0, [0.25, 0.75]) for l1 in policy_l1]
 
 
 def test_mean_and_t_interval_of_three_seeds() -> None:

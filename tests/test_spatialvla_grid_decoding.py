@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 import torch
-from decode_speed_grid import StockGenerate
+from decode_ways import CellsByGenerate
 from spatialvla_grid_cases import make_batch, make_policy, rows
 from torch import Tensor
 
@@ -18,7 +18,7 @@ def test_it_chooses_what_generate_chooses(batch_size: int, num_dims: int) -> Non
     for seed in range(3):
         policy = make_policy(seed, num_dims)
         batch = make_batch(policy, batch_size, seed)
-        generate = StockGenerate(policy)
+        generate = CellsByGenerate(policy)
         cells = policy.choose(batch, policy.config.chunk_size)
         assert torch.equal(cells.flatten(1), generate(generate.inputs(batch)).numbers)
 
