@@ -25,9 +25,8 @@ def sensitivity(group: Group) -> Table | None:
     table = [[Cell(axis), _slope_cell(slopes.get(axis)), _share_cell(shares.get(axis))] for axis in names]
     note = (
         "Points per level: slope of success in percentage points, by least squares over the levels of this "
-        "axis alone, with a 95 % bootstrap interval over episodes (all alike: each resample has the same). The "
-        "intervals are not adjusted for the number of axes. "
-        "Share: of the variance of success where the levels of several axes were drawn, what this axis "
+        "axis alone, with a 95 % bootstrap interval over episodes (all alike: each resample has the same). "
+        "The intervals are not adjusted for the number of axes. Share: of the variance of success where the levels of several axes were drawn, what this axis "
         "explains alone (epsilon squared: 0 on average where it has no effect)."
     )
     return Table(f"Sensitivity: {group.name}", ["axis", "points per level", "share of variance"], table, note)
