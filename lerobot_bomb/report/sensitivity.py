@@ -26,7 +26,8 @@ def sensitivity(group: Group) -> Table | None:
     note = (
         "Points per level: slope of success in percentage points, by least squares over the levels of this "
         "axis alone, with a 95 % bootstrap interval over episodes (all alike: each resample has the same). "
-        "The intervals are not adjusted for the number of axes. Share: of the variance of success where the levels of several axes were drawn, what this axis "
+        "The intervals are not adjusted for the number of axes. "
+        "Share: of the variance of success where the levels of several axes were drawn, what this axis "
         "explains alone (epsilon squared: 0 on average where it has no effect)."
     )
     return Table(f"Sensitivity: {group.name}", ["axis", "points per level", "share of variance"], table, note)
