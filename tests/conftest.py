@@ -11,7 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from kept_work import check_numbers_once, keep_distributions, keep_flags, look_at_columns_once
+from kept_work import (
+    check_numbers_once,
+    keep_contexts,
+    keep_distributions,
+    keep_flags,
+    look_at_columns_once,
+)
 from recipes import POLICY_TYPES
 from variants import variants_of
 
@@ -45,6 +51,8 @@ SLOWEST_FILES = (
 FAST_TYPE = "vla0_smol"
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# without a GPU, OpenGL draws small images in a quarter less time if it starts no threads; not a bit differs
+os.environ.setdefault("LP_NUM_THREADS", "0")
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test may need the network
 
 
@@ -141,7 +149,10 @@ def kept_work() -> Iterator[None]:
         if "lerobot" in sys.modules:  # importing it takes seconds, and many tests do without
             look_at_columns_once(patch)
             check_numbers_once(patch)
+        contexts = keep_contexts(patch) if "lerobot_env_bomb.render" in sys.modules else []
         yield
+        for context in contexts:
+            context.free()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -215,6 +226,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--policy.type", dest="policy_type", choices=POLICY_TYPES, help="prove this one only")
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Collect no garbage while modules are imported: there is hardly any, and it takes seconds."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Sort the slowest files to the front, and leave the others as they are."""
     places = {name: place for place, name in enumerate(SLOWEST_FILES)}
@@ -230,6 +251,7 @@ def pytest_collection_finish() -> None:
         importlib.import_module("lerobot_policy_bomb")
     gc.collect()
     gc.freeze()
+    gc.set_threshold(20_000, *gc.get_threshold()[1:])  # the usual 700 is soon reached
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
