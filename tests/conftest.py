@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from fresh_processes import serving
 from kept_work import (
     check_numbers_once,
     keep_contexts,
@@ -220,6 +221,14 @@ def loaded_policies() -> Iterator[None]:
 
     yield
     explain_cases.loaded.cache_clear()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Start the server of fresh processes; xdist's workers, which have the address, use it too."""
+    if not hasattr(config, "workerinput"):
+        server = serving()
+        server.__enter__()
+        config.add_cleanup(lambda: server.__exit__(None, None, None))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
