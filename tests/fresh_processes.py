@@ -74,7 +74,7 @@ def run(job: dict[str, Any], files: list[int]) -> None:
     os.chdir(job["cwd"])
     os.environ.clear()
     os.environ.update(job["env"])
-    sys.argv = job["argv"]
+    sys.argv, sys.path[0] = job["argv"], ""
     exec(compile(job["program"], "<string>", "exec"), {"__name__": "__main__"})
 
 
