@@ -11,7 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from kept_work import check_numbers_once, keep_distributions, keep_flags, look_at_columns_once
+from fresh_processes import serving
+from kept_work import (
+    check_numbers_once,
+    keep_contexts,
+    keep_distributions,
+    keep_flags,
+    look_at_columns_once,
+)
 from recipes import POLICY_TYPES
 from variants import variants_of
 
@@ -26,25 +33,32 @@ SLOWEST_FILES = (
     "test_long",
     "test_parity",
     "test_explain_command",
-    "test_record_kill",
-    "test_parts",
-    "test_replay",
-    "test_record",
     "test_bomb_libero_env",
+    "test_record_kill",
+    "test_vla0_smol_checkpoint",
+    "test_commands",
+    "test_parts",
+    "test_record",
+    "test_replay",
+    "test_independence",
     "test_shipped",
     "test_sweep",
-    "test_serve",
+    "test_sweep_manifest",
     "test_axes_env",
     "test_processes",
     "test_fdvla",
     "test_lora",
     "test_spatialvla_grid",
+    "test_vla0_smol_backbones",
+    "test_vla0_smol_pointing",
 )
 
 # runs the tests that are marked one_type in `make test`, too
 FAST_TYPE = "vla0_smol"
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# without a GPU, OpenGL draws small images in a quarter less time if it starts no threads; not a bit differs
+os.environ.setdefault("LP_NUM_THREADS", "0")
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test may need the network
 
 
@@ -141,7 +155,10 @@ def kept_work() -> Iterator[None]:
         if "lerobot" in sys.modules:  # importing it takes seconds, and many tests do without
             look_at_columns_once(patch)
             check_numbers_once(patch)
+        contexts = keep_contexts(patch) if "lerobot_env_bomb.render" in sys.modules else []
         yield
+        for context in contexts:
+            context.free()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -211,8 +228,26 @@ def loaded_policies() -> Iterator[None]:
     explain_cases.loaded.cache_clear()
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Start the server of fresh processes; xdist's workers, which have the address, use it too."""
+    if not hasattr(config, "workerinput"):
+        server = serving()
+        server.__enter__()
+        config.add_cleanup(lambda: server.__exit__(None, None, None))
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--policy.type", dest="policy_type", choices=POLICY_TYPES, help="prove this one only")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Collect no garbage while modules are imported: there is hardly any, and it takes seconds."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -230,6 +265,7 @@ def pytest_collection_finish() -> None:
         importlib.import_module("lerobot_policy_bomb")
     gc.collect()
     gc.freeze()
+    gc.set_threshold(20_000, *gc.get_threshold()[1:])  # the usual 700 is soon reached
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

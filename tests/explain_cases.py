@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.checkpoints.shipped import checkpoint_path, shipped_names
 from lerobot_bomb.envs.rollout import expert_agent, make_env, run_episode
 from lerobot_bomb.explain.images import filling
@@ -55,6 +57,12 @@ def moment() -> tuple[dict[str, Any], str, dict[str, dict[str, Any]], dict[str, 
                 masks = env.get_wrapper_attr("object_masks")()
                 return each.observation, each.instruction, masks, env.get_wrapper_attr("alternatives")()
     raise AssertionError("the episode is shorter")
+
+
+def end_episodes_after(max_steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let episodes of `place` end early, whose many steps most of an explanation's time would go to."""
+    suite = replace(find_suite("place"), max_steps=max_steps)
+    monkeypatch.setattr("lerobot_env_bomb.env.find_suite", lambda _: suite)
 
 
 def ask(

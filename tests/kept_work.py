@@ -6,6 +6,7 @@ Most of a short command's time went there. Results are the same.
 import functools
 import inspect
 import sys
+import threading
 import typing
 from importlib import metadata
 from types import SimpleNamespace
@@ -41,6 +42,32 @@ def look_at_columns_once(patch: pytest.MonkeyPatch) -> None:
         features._column_requires_decoding[column] = require_decoding(feature)
 
     patch.setattr(Features, "__setitem__", set_feature)
+
+
+def keep_contexts(patch: pytest.MonkeyPatch) -> list[Any]:
+    """Draw in the OpenGL contexts of environments that were closed, as each compiles its shaders anew.
+
+    Return those that no environment has.
+    """
+    render: Any = sys.modules["lerobot_env_bomb.render"]
+    usual, idle, here = render.GLContext, [], threading.main_thread()
+
+    class KeptContext:
+        def __init__(self, *size: int) -> None:
+            self._is_kept = threading.current_thread() is here
+            self._context = idle.pop() if self._is_kept and idle else usual(*size)
+
+        def make_current(self) -> None:
+            self._context.make_current()
+
+        def free(self) -> None:
+            if self._is_kept:
+                idle.append(self._context)
+            else:
+                self._context.free()
+
+    patch.setattr(render, "GLContext", KeptContext)
+    return idle
 
 
 def check_numbers_once(patch: pytest.MonkeyPatch) -> None:

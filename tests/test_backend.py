@@ -1,9 +1,11 @@
+import functools
 import os
 import platform
 import subprocess
 import sys
 
 import pytest
+from fresh_processes import FreshProcess
 
 pytestmark = pytest.mark.skipif(platform.system() != "Linux", reason="the backend is chosen on Linux only")
 CHOSEN = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "LEROBOT_BOMB_PROBED_GL", "DISPLAY", "WAYLAND_DISPLAY")
@@ -99,13 +101,10 @@ def test_a_chosen_backend_is_tried_in_the_first_process_only() -> None:
 
 def test_lerobots_commands_say_in_a_line_that_nothing_can_be_drawn() -> None:
     flags = ["--policy.type=bomb_expert", "--env.type=bomb", "--eval.batch_size=2", "--eval.n_episodes=2"]
-    run = subprocess.run(
-        [sys.executable, "-m", "lerobot.scripts.lerobot_eval", *flags, "--eval.use_async_envs=true"],
-        env=without_choice() | {"MUJOCO_GL": "glfw"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    program = "import sys; from lerobot.scripts import lerobot_eval; sys.argv[0] = 'lerobot-eval'\n"
+    program += "lerobot_eval.main()"
+    env = without_choice() | {"MUJOCO_GL": "glfw"}
+    run = FreshProcess(program, *flags, "--eval.use_async_envs=true", env=env).wait()
     assert run.returncode == 1
     assert last_line(run).startswith("lerobot-eval: error: MuJoCo cannot render on this machine")
     assert "Traceback" not in run.stderr
@@ -130,6 +129,7 @@ print(os.environ["MUJOCO_GL"], digest)
 """
 
 
+@functools.cache
 def draw_after(first: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Draw an episode's first images in a fresh process, once this has run in it."""
     code = DRAWN.format(first=first)

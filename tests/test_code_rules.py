@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -12,11 +13,21 @@ FRAGMENT = re.compile(
 )
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
+def nodes_of(path: Path) -> list[ast.AST]:
+    return list(ast.walk(parsed(path)))
+
+
 def test_no_docstring_opens_with_a_fragment() -> None:
     """Check that each starts with a verb or a noun phrase, which a stranger understands alone."""
     fragments, num_docstrings = [], 0
     for path in (path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes_of(path):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.Module):
                 docstring = ast.get_docstring(node)
                 num_docstrings += docstring is not None
@@ -33,7 +44,7 @@ FAMILIES |= {"build_model": "/building_", "make_layout": "/building_", "make_poi
 def test_no_two_public_classes_or_functions_have_one_name() -> None:
     places: dict[str, set[str]] = {}
     for path in (path for folder in FOLDERS[:3] for path in (ROOT / folder).rglob("*.py")):
-        for node in ast.parse(path.read_text()).body:
+        for node in parsed(path).body:
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
                 kind = FAMILIES.get(node.name)
                 place = kind if kind and kind in str(path) else str(path.relative_to(ROOT))
@@ -46,7 +57,7 @@ def test_scores_of_a_policy_reach_into_none_of_its_private_members() -> None:
     reached = [
         f"{path.relative_to(ROOT)}: {ast.unparse(node)}"
         for path in paths
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in nodes_of(path)
         if isinstance(node, ast.Attribute)
         and re.match(r"_(?!_)", node.attr)
         and ast.unparse(node.value) != "self"
@@ -58,7 +69,7 @@ def test_no_variable_or_parameter_is_named_of() -> None:
     """Check that each has a name that says what it holds."""
     places, num_names = [], 0
     for path in (path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes_of(path):
             if isinstance(node, ast.Name | ast.arg):
                 num_names += 1
                 if (node.id if isinstance(node, ast.Name) else node.arg) == "of":

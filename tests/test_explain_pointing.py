@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from explain_cases import OPTIONS, SPEC
+from explain_cases import OPTIONS, SPEC, end_episodes_after
 from pointing_cases import PLACES, POINTING
 from policy_cases import save_checkpoint
 
@@ -244,8 +244,9 @@ def test_means_are_of_the_episodes_that_point() -> None:
 
 
 def test_a_checkpoint_that_points_is_explained_with_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    end_episodes_after(5, monkeypatch)
     save_checkpoint("fdvla", tmp_path / "checkpoint", **POINTING["fdvla"], chunk_size=1, n_action_steps=1)
     flags = [f"--policy.path={tmp_path / 'checkpoint'}", "--seed=100003", "--grid=1", "--fill=other"]
     assert main(["explain", *flags, "--step=0", f"--output={tmp_path / 'why'}"]) == 0

@@ -3,13 +3,12 @@
 import gc
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fresh_processes import FreshProcess
 from lerobot.common import train_utils
 from lerobot.configs import parser
 from lerobot.policies import PreTrainedPolicy
@@ -99,9 +98,7 @@ print("RESULT" + json.dumps([registered, stock, used, known_before, evaluating])
 
 @pytest.fixture(scope="module")
 def seen() -> list[Any]:
-    ended = subprocess.run(
-        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False, timeout=280
-    )
+    ended = FreshProcess(PROGRAM).wait()
     assert ended.returncode == 0, ended.stderr
     return json.loads(ended.stdout.partition("RESULT")[2])
 

@@ -38,9 +38,12 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recording_module, "SCENES", 2)
 
 
-def stand_still_for_white(state: PrivilegedState) -> np.ndarray:
-    still = np.array([0, 0, 0, 1], dtype=np.float32)
-    return still if state.stone_is_white[state.goals[0].stone] else expert_action(state)
+def misplace_white(state: PrivilegedState) -> np.ndarray:
+    """Put white stones down 2 cm from their place: that fails, and sooner than standing still."""
+    (goal,) = state.goals
+    if state.stone_is_white[goal.stone]:
+        state = replace(state, goals=(replace(goal, xyz=goal.xyz + np.array([0.02, 0, 0])),))
+    return expert_action(state)
 
 
 def go_down(observation: dict[str, Any], instruction: str) -> np.ndarray:
@@ -48,7 +51,7 @@ def go_down(observation: dict[str, Any], instruction: str) -> np.ndarray:
 
 
 EXPERT = EpisodeSource()
-HALF = EpisodeSource(expert=stand_still_for_white)
+HALF = EpisodeSource(expert=misplace_white)
 OTHER = EpisodeSource(behavior=BehaviorPolicy(lambda: None, go_down))
 
 

@@ -72,9 +72,12 @@ def stand_still(state: PrivilegedState) -> np.ndarray:
     return np.array([0, 0, 0, 1], dtype=np.float32)
 
 
-def stand_still_for_white(state: PrivilegedState) -> np.ndarray:
-    act = stand_still if state.stone_is_white[state.goals[0].stone] else expert_action
-    return act(state)
+def misplace_white(state: PrivilegedState) -> np.ndarray:
+    """Put white stones down 2 cm from their place: that fails, and sooner than standing still."""
+    (goal,) = state.goals
+    if state.stone_is_white[goal.stone]:
+        state = replace(state, goals=(replace(goal, xyz=goal.xyz + np.array([0.02, 0, 0])),))
+    return expert_action(state)
 
 
 @pytest.mark.parametrize("recording", [VIDEO, IMAGES], ids=["video", "images"])
@@ -201,7 +204,7 @@ def test_the_number_of_workers_does_not_change_a_byte(datasets: dict[str, Path],
 
 def test_failed_episodes_are_left_out_and_counted(tmp_path: Path) -> None:
     recording = Recording("test/half", episodes=3, image_size=SIZE)
-    progress = record(recording, tmp_path / "half", expert=stand_still_for_white)
+    progress = record(recording, tmp_path / "half", expert=misplace_white)
     rows = episode_rows(tmp_path / "half")
     kept = [row["bomb/seed"] for row in rows]
     failed = [failure["seed"] for failure in progress.failures]

@@ -18,6 +18,8 @@ from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.record import ORIGIN
 from lerobot_bomb.viewing.replay import Replay
 
+FLAGS = ("--policy.num_inference_steps=3",)
+
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
@@ -51,7 +53,7 @@ def rewritten(path: Path, file: Path, **changes: Any) -> Path:
 @pytest.mark.parametrize(
     ("policy", "flags"),
     [
-        ("bomb:fdvla", ()),  # whose noise is a sequence that all episodes share
+        ("bomb:fdvla", FLAGS),  # whose noise is a sequence that all episodes share
         pytest.param("bomb:vla0_smol", (), marks=pytest.mark.long),
         pytest.param("bomb:spatialvla_grid", (), marks=pytest.mark.long),
         pytest.param("bomb_random", ("--env.fps=2",), marks=pytest.mark.long),  # uses up an episode's 10 s
@@ -70,20 +72,21 @@ def test_a_record_is_run_again_bit_for_bit(
     assert sizes == [0, 1]
     is_timed = [bool(json.loads(line)["inference"]) for line in path.read_text().splitlines()]
     assert is_timed == [policy.startswith("bomb:")] * 2  # the replay is not, which makes no difference
+    of_policy = [flag for flag in flags if flag.startswith("--policy.")]
     for line in (1, 2):
-        assert main(["replay", str(path), f"--line={line}", f"--output={tmp_path / str(line)}"]) == 0
+        output = f"--output={tmp_path / str(line)}"
+        assert main(["replay", str(path), f"--line={line}", output, *of_policy]) == 0
         assert "as recorded, bit for bit: spec, instruction, " in capsys.readouterr().out
 
 
 def test_flags_of_the_evaluation_are_given_again(
     results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flag = "--policy.num_inference_steps=3"
-    path = results("bomb:fdvla", flag)
+    """Check that they are asked for; with them, the record above is run again."""
+    path = results("bomb:fdvla", *FLAGS)
     assert main(["replay", str(path), f"--output={tmp_path / 'x'}"]) == 1
     assert "other settings; give the flags --policy.NAME=VALUE" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-    assert main(["replay", str(path), f"--output={tmp_path / 'x'}", flag]) == 0
 
 
 @pytest.mark.parametrize(
@@ -144,7 +147,7 @@ def test_what_differs_first_is_told(
 def test_other_weights_are_refused(
     results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = results("bomb:fdvla")
+    path = results("bomb:fdvla", *FLAGS)
     policy = json.loads(path.read_text().splitlines()[0])["policy"]
     other = rewritten(path, tmp_path / "r.jsonl", policy=policy | {"weights_sha256": "0" * 64})
     assert main(["replay", str(other), f"--output={tmp_path / 'x'}"]) == 1
@@ -152,7 +155,7 @@ def test_other_weights_are_refused(
     moved = rewritten(path, tmp_path / "m.jsonl", policy=policy | {"path": "gone"})
     assert main(["replay", str(moved), f"--output={tmp_path / 'x'}"]) == 1
     assert "--policy.path=gone: there is no such folder" in capsys.readouterr().err
-    assert main(["replay", str(moved), f"--output={tmp_path / 'x'}", "--policy.path=bomb:fdvla"]) == 0
+    assert main(["replay", str(moved), f"--output={tmp_path / 'x'}", "--policy.path=bomb:fdvla", *FLAGS]) == 0
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ LEVELS = "Success over the levels of an axis"
 type Rows = list[dict[str, Any]]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def rows() -> Rows:
     """Make rows of two policies, three conditions, 12 seeds, and outcomes that differ."""
     made = []
@@ -37,9 +37,10 @@ def rows() -> Rows:
     return made
 
 
-@pytest.fixture
-def written(rows: Rows, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def written(rows: Rows, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a report of these rows, in two files."""
+    tmp_path = tmp_path_factory.mktemp("written")
     for number in range(2):
         part = [row for row in rows if (row["policy"]["type"] == "fdvla") == number]
         (tmp_path / f"{number}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in part))

@@ -1,8 +1,6 @@
 """`lerobot-bomb serve` and LeRobot's own client: BOMB gets what the policy foresees here."""
 
-import signal
 import socket
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from fresh_processes import FreshProcess
 from lerobot.async_inference.configs import PolicyServerConfig
 from robot_cases import BombArm, Loaded
 
@@ -50,27 +49,13 @@ def answers(port: int) -> bool:
 def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """Start a server in a process of its own, which Ctrl-C ends, and yield its port."""
     number = free_port()
-    command = [
-        sys.executable,
-        "-m",
-        "lerobot_bomb.commands.main",
-        "serve",
-        f"--port={number}",
-        "--inference_latency=0",
-    ]
-    log = tmp_path_factory.mktemp("server") / "log"
-    with log.open("w") as output:
-        server = subprocess.Popen(
-            command,
-            cwd=log.parent,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            # a job in the background starts ignoring it
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-        )
-        yield number
-        server.send_signal(signal.SIGINT)
-        assert server.wait(TIMEOUT_S) == CTRL_C, log.read_text()
+    program = "import sys; from lerobot_bomb.commands.main import main; sys.exit(main(sys.argv[1:]))"
+    flags = f"--port={number}", "--inference_latency=0"
+    server = FreshProcess(program, "serve", *flags, cwd=tmp_path_factory.mktemp("server"))
+    yield number
+    server.press_ctrl_c()
+    ended = server.wait()
+    assert ended.returncode == CTRL_C, ended.stderr
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,6 @@
 """Unpickling by the policy server: LeRobot's messages, as pickle reads them, and nothing that harms it."""
 
 import pickle
-import subprocess
-import sys
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any
@@ -10,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from fresh_processes import FreshProcess
 from lerobot.async_inference.helpers import RemotePolicyConfig, TimedObservation
 from test_serve_limits import Runs
 from torch._utils import _rebuild_tensor_v2
@@ -174,8 +173,7 @@ def test_a_hostile_pickle_ends_no_process_and_takes_no_memory(tmp_path: Path) ->
     paths = [tmp_path / name for name in (*pickles, *CRAFTED)]
     for path, data in zip(paths, (*pickles.values(), *CRAFTED.values()), strict=True):
         path.write_bytes(data)
-    command = [sys.executable, "-c", UNPICKLE, *map(str, paths)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    done = FreshProcess(UNPICKLE, *map(str, paths), cwd=tmp_path).wait()
     assert done.returncode == 0, done.stderr
     *refused, more_mib = done.stdout.splitlines()
     assert [line.partition(" refused: ")[0] for line in refused] == [path.name for path in paths]
