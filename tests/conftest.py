@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -231,9 +232,9 @@ def loaded_policies() -> Iterator[None]:
 def pytest_configure(config: pytest.Config) -> None:
     """Start the server of fresh processes; xdist's workers, which have the address, use it too."""
     if not hasattr(config, "workerinput"):
-        server = serving()
-        server.__enter__()
-        config.add_cleanup(lambda: server.__exit__(None, None, None))
+        started = ExitStack()
+        started.enter_context(serving())
+        config.add_cleanup(started.close)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

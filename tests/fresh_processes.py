@@ -50,7 +50,7 @@ class FreshProcess:
             with file:
                 file.seek(0)
                 printed.append(file.read())
-        return subprocess.CompletedProcess(self._pid, code, *printed)
+        return subprocess.CompletedProcess(str(self._pid), code, *printed)
 
 
 @contextmanager
