@@ -66,7 +66,7 @@ def require_idle_machine(force: bool) -> None:
 
 
 def device_name(device: str) -> str:
-    """Return the name of "cpu" or of the CUDA device; exit with code 1 if there is none."""
+    """Print and return the name of "cpu" or of the CUDA device; exit with code 1 if there is none."""
     import torch
 
     if device == "cuda" and not torch.cuda.is_available():

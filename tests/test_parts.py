@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from test_record import misplace_white
 
-from lerobot_bomb.bomb.expert import expert_action
-from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.data import recording as recording_module
 from lerobot_bomb.data import resumable
@@ -36,14 +35,6 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of 2 episodes, and 2 scenes an episode."""
     monkeypatch.setattr(resumable, "BLOCK_EPISODES", 2)
     monkeypatch.setattr(recording_module, "SCENES", 2)
-
-
-def misplace_white(state: PrivilegedState) -> np.ndarray:
-    """Put white stones down 2 cm from their place: that fails, and sooner than standing still."""
-    (goal,) = state.goals
-    if state.stone_is_white[goal.stone]:
-        state = replace(state, goals=(replace(goal, xyz=goal.xyz + np.array([0.02, 0, 0])),))
-    return expert_action(state)
 
 
 def go_down(observation: dict[str, Any], instruction: str) -> np.ndarray:

@@ -47,10 +47,6 @@ SINGLE: dict[str, dict[str, Options]] = {
         "pool_all": POOL_ALL,
     },
 }
-# for the fast tests: as much is learned by heart in half the time
-QUICK: dict[str, Options] = {
-    "fdvla": {"draws_per_chunk": 8, "num_inference_steps": 4, "freeze_vision_encoder": True}
-}
 # two at once, for the fast tests: what passes with both holds for each, and costs half
 PAIRS: dict[str, dict[str, Options]] = {
     "vla0_smol": {
@@ -86,8 +82,7 @@ def layers_of(options: Options) -> Options:
 
 def variants_of(policy_type: str, *, is_long: bool) -> list[Any]:
     """Parameters (policy_type, options): the recipe, then options, in pairs unless there is time for each."""
-    recipe = {} if is_long else QUICK.get(policy_type, {})
-    variants = [pytest.param(policy_type, recipe, id=policy_type)]
+    variants = [pytest.param(policy_type, {}, id=policy_type)]
     for group, marks in ((PAIRS, ()), (SINGLE, (pytest.mark.long,))):
         if group is SINGLE or not is_long:
             variants += [
