@@ -8,7 +8,6 @@ from typing import Annotated, ClassVar, Self
 
 import numpy as np
 
-from lerobot_bomb import __version__
 from lerobot_bomb.bomb.board import BOARD, COLORS, task_id
 from lerobot_bomb.bomb.environment import Environment, numbered_tasks
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec, Failure, Stage
@@ -28,15 +27,9 @@ from lerobot_bomb.bootstrap import bca_interval, format_bounds, sums_by
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.results import schema
-from lerobot_bomb.results.origin import (
-    PolicyIdentity,
-    installed_version,
-    json_list,
-    machine_name,
-    uses_sapien,
-)
+from lerobot_bomb.results.origin import installed_version, json_list, uses_sapien
 from lerobot_bomb.results.record import NO_VALUE, NOT_RECORDED, Measure, Record, describe_numbers
-from lerobot_bomb.results.schema import Count, Natural, Quantity
+from lerobot_bomb.results.schema import Count, Quantity
 
 OLD_VERSION = "1.0"  # whose records say less
 # outcomes of an episode in which the stone was carried and put down somewhere on the board
@@ -128,7 +121,6 @@ class EpisodeResult(Record):
     steps: Count  # control steps
     # share of the moves that were made; null: not recorded
     progress: Annotated[float | None, lambda value: value is not None and 0 <= value <= 1]
-    is_success: bool
     is_success_bomb_v0: bool  # success by the original benchmark's rule, within 26 mm
     failure: Annotated[str, schema.among(Failure)] | None
     # how far the episode got: start, reached, grasped, lifted, placed
@@ -136,25 +128,19 @@ class EpisodeResult(Record):
     placement_error_mm: Quantity  # horizontal distance of the stone from the target
     nearest_intersection: tuple[Line, Line]  # row and column where the stone is
     collateral_mm: Quantity  # largest distance by which another stone was moved
-    levels: dict[str, Natural] = field(default_factory=dict)
     image_size: Annotated[int, schema.between(MIN_IMAGE_SIZE, MAX_IMAGE_SIZE)] = DEFAULT_IMAGE_SIZE
     # --env.render_preset
     render_preset: Annotated[str, schema.among(RENDER_PRESETS)] = RenderOptions.preset
     # --env.task_ids of the whole evaluation; null: not given
     task_ids: Annotated[tuple[TaskId, ...], lambda value: len(value) > 0] | None = None
-    policy: PolicyIdentity | None = None
     # maker of the OpenGL driver that rendered the images, or Vulkan; null: nothing was rendered
     opengl_vendor: str | None = None
     # the driver's renderer
     opengl_renderer: str | None = None
-    machine: str = field(default_factory=machine_name)
     # installed MuJoCo
     mujoco_version: str | None = field(default_factory=partial(installed_version, "mujoco"))
     # installed SAPIEN; null: it neither simulated nor drew
     sapien_version: str | None = None
-    lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
-    torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
-    package_version: str = __version__
     task_version: str  # version of the suite's episodes
     protocol_version: str = PROTOCOL_VERSION
 

@@ -5,18 +5,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, ClassVar, Protocol, Self
 
-from lerobot_bomb import __version__
 from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.libero.episode import LIBERO_PROTOCOL_VERSION, LiberoFailure, LiberoSpec
 from lerobot_bomb.libero.perturbations import LiberoCondition
 from lerobot_bomb.results import schema
-from lerobot_bomb.results.origin import (
-    PolicyIdentity,
-    describe_versions,
-    installed_version,
-    installed_versions,
-    machine_name,
-)
+from lerobot_bomb.results.origin import describe_versions, installed_versions
 from lerobot_bomb.results.record import Record, describe_numbers
 from lerobot_bomb.results.schema import Count, Natural
 
@@ -68,19 +61,12 @@ class LiberoResult(Record):
     instruction: str  # text that the policy read
     initial_state: Natural  # number of the task's recorded state in which the episode started
     steps: Count  # control steps
-    is_success: bool
     failure: Annotated[str, schema.among(LiberoFailure)] | None
-    levels: dict[str, Natural] = field(default_factory=dict)
     image_size: str = "256x256"
     control_mode: str = "relative"  # --env.control_mode
     fps: Count = 20  # control steps per second
-    policy: PolicyIdentity | None = None
     # {package on which the bits of an episode depend: its version}
     simulator_versions: dict[str, str | None] = field(default_factory=partial(installed_versions, SIMULATOR))
-    machine: str = field(default_factory=machine_name)
-    lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
-    torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
-    package_version: str = __version__
     protocol_version: str = LIBERO_PROTOCOL_VERSION
 
     def check_episode(self) -> None:

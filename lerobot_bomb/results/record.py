@@ -7,15 +7,16 @@ import dataclasses
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass, field
+from functools import partial
 from operator import attrgetter
 from typing import Any, ClassVar, Protocol, Self
 
+from lerobot_bomb import __version__
 from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.conditions import AxisCondition
 from lerobot_bomb.results.inference import Inference
-from lerobot_bomb.results.origin import Evaluation, PolicyIdentity
+from lerobot_bomb.results.origin import Evaluation, PolicyIdentity, installed_version, machine_name
 from lerobot_bomb.results.schema import SHOWN_CHARACTERS, Natural, Quantity
 
 NOT_RECORDED = "not recorded"
@@ -56,8 +57,8 @@ class Measure:
 class Record(ABC):
     """Result of an episode.
 
-    A subclass for each environment names all fields, in the order in which they are written; those that it
-    does not name come last. Reading checks a field by its type. A new field goes into `earlier`.
+    A subclass for each environment adds its own fields. Reading checks a field by its type. A new field goes
+    into `earlier`.
     """
 
     env_type: ClassVar[str]
@@ -90,13 +91,16 @@ class Record(ABC):
     spec: Spec
     is_success: bool  # the episode succeeded
     failure: str | None  # failure class; null: success
-    levels: dict[str, Natural]  # {perturbation axis that was on: its level}
+    # {perturbation axis that was on: its level}
+    levels: dict[str, Natural] = field(default_factory=dict)
     image_size: int | str  # width and height of the images in pixels
-    policy: PolicyIdentity | None  # policy that acted; null: not known
-    machine: str  # processor and C library
-    lerobot_version: str | None  # installed LeRobot
-    torch_version: str | None  # installed torch
-    package_version: str  # version of this package
+    policy: PolicyIdentity | None = None  # policy that acted; null: not known
+    machine: str = field(default_factory=machine_name)  # processor and C library
+    # installed LeRobot
+    lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
+    # installed torch
+    torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
+    package_version: str = __version__  # version of this package
     protocol_version: str  # how results are measured and written
     # mean length of the executed actions' second differences, gripper left out; null: fewer than four actions
     action_j2: Quantity | None = None
@@ -106,9 +110,8 @@ class Record(ABC):
     evaluation: Evaluation | None = None  # evaluation that it is of; null: not recorded, or of none
 
     def as_json(self) -> dict[str, Any]:
-        """Return the fields in the order of a record."""
-        values = dataclasses.asdict(self)
-        return {name: values[name] for name in field_names(type(self))}
+        """Return the fields as a JSON object."""
+        return dataclasses.asdict(self)
 
     def to_json(self) -> str:
         """Return the record, a line of JSON.
@@ -197,19 +200,6 @@ class Record(ABC):
         return ""
 
 
-@cache
-def field_names(record_type: type[Record]) -> tuple[str, ...]:
-    """Return the names of the fields in the order in which they are written."""
-    known = {each.name for each in dataclasses.fields(record_type)}
-    named = (name for base in record_type.__mro__ for name in vars(base).get("__annotations__", ()))
-    return tuple(dict.fromkeys(name for name in named if name in known))
-
-
-def without_measured[R: Record](record: R) -> R:
-    """Return a record without the fields that change when its episode is run again."""
-    return replace(record, **dict.fromkeys(MEASURED))
-
-
 def outcome_fields(record: Record) -> list[str]:
     """Return the names of the fields of spec and outcome, not of policy, machine and latency.
 
@@ -218,8 +208,8 @@ def outcome_fields(record: Record) -> list[str]:
     missing = object()
     return [
         name
-        for name in field_names(type(record))
-        if name not in ORIGIN | MEASURED and getattr(record, name) != record.earlier.get(name, missing)
+        for name, value in vars(record).items()
+        if name not in ORIGIN | MEASURED and value != record.earlier.get(name, missing)
     ]
 
 
