@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
-from lerobot_bomb.results.groups import policy_key
-from lerobot_bomb.results.names import policy_names
+from lerobot_bomb.results.names import policy_key, policy_names
 from lerobot_bomb.results.played import describe_missing_episodes
 from lerobot_bomb.results.reading import check_any, read_records
 from lerobot_bomb.results.record import Record, describe_numbers
@@ -101,8 +100,9 @@ def policy_keys(flag: str, names: Sequence[str], records: Sequence[Record]) -> l
     Raises:
         ValueError: a name fits no policy, or several.
     """
-    first = {policy_key(each): each for each in reversed(records)}
-    first = dict(reversed(first.items()))
+    first: dict[str, Record] = {}
+    for record in records:
+        first.setdefault(policy_key(record.policy), record)
     described = {key: record.describe_policy() for key, record in first.items()}
     short = dict(zip(first, policy_names([each.policy for each in first.values()]), strict=True))
     found = []

@@ -27,8 +27,8 @@ from lerobot_bomb.bootstrap import bca_interval, format_bounds, sums_by
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.results import schema
-from lerobot_bomb.results.origin import installed_version, json_list, uses_sapien
-from lerobot_bomb.results.record import NO_VALUE, NOT_RECORDED, Measure, Record, describe_numbers
+from lerobot_bomb.results.origin import NOT_RECORDED, installed_version, json_list, uses_sapien
+from lerobot_bomb.results.record import NO_VALUE, Measure, Record, describe_numbers
 from lerobot_bomb.results.schema import Count, Quantity
 
 OLD_VERSION = "1.0"  # whose records say less

@@ -32,9 +32,7 @@ def policy_names(
     for parts in (_path_parts, _interventions, _weights, _settings):
         names = _extended(names, known, parts)
     chosen = given or {}
-    return numbered(
-        [chosen.get(policy_key(each), name) for each, name in zip(policies, names, strict=True)]
-    )
+    return numbered([chosen.get(policy_key(each), name) for each, name in zip(policies, names, strict=True)])
 
 
 def numbered(names: Sequence[str]) -> list[str]:

@@ -16,10 +16,15 @@ from lerobot_bomb import __version__
 from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.conditions import AxisCondition
 from lerobot_bomb.results.inference import Inference
-from lerobot_bomb.results.origin import Evaluation, PolicyIdentity, installed_version, machine_name
+from lerobot_bomb.results.origin import (
+    NOT_RECORDED,
+    Evaluation,
+    PolicyIdentity,
+    installed_version,
+    machine_name,
+)
 from lerobot_bomb.results.schema import SHOWN_CHARACTERS, Natural, Quantity
 
-NOT_RECORDED = "not recorded"
 NO_VALUE = "-"  # of a measure that these episodes do not have
 MAX_RUNS = 10  # of numbers, in a heading
 
