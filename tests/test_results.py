@@ -80,7 +80,7 @@ DAMAGED: dict[str, Any] = {
     "placement_error_mm=NaN is impossible": {"placement_error_mm": float("nan")},
     "collateral_mm=-1.0 is impossible": {"collateral_mm": -1.0},
     'failure="bored" is impossible': {"failure": "bored"},
-    "is_success=True with failure='dropped'": {"failure": "dropped", "is_success": True},
+    'is_success=true is impossible with failure="dropped"': {"failure": "dropped", "is_success": True},
     "steps=0 is impossible": {"steps": 0},
     "steps=true is impossible": {"steps": True},
     'stage="released" is impossible': {"stage": "released"},
@@ -96,7 +96,7 @@ DAMAGED: dict[str, Any] = {
     "perturbations": {"spec": asdict(EpisodeSpec(0)) | {"perturbations": "camera:9"}},
     "it lacks spec.robot": {"spec": {k: v for k, v in asdict(EpisodeSpec(0)).items() if k != "robot"}},
     "spec has wind, of which": {"spec": asdict(EpisodeSpec(0)) | {"wind": 3}},
-    "target=[2, 2], but spec.target=[1, 1]": {"spec": asdict(EpisodeSpec(0, target=(1, 1)))},
+    "target=[2, 2] is impossible with spec.target=[1, 1]": {"spec": asdict(EpisodeSpec(0, target=(1, 1)))},
     "protocol_version '0.0'; this package reads 1.0, 1.1, pusht-1.0": {"protocol_version": "0.0"},
 }
 

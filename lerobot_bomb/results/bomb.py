@@ -149,10 +149,8 @@ class EpisodeResult(Record):
         versions = dict.fromkeys((FIRST_VERSION, find_suite(spec.suite).version))
         one_of(f"task_version of suite {spec.suite}", self.task_version, tuple(versions))
         for name in ("target", "color"):
-            asked, value = getattr(spec, name), getattr(self, name)
-            if asked not in (None, value):
-                shown = [list(each) if isinstance(each, tuple) else each for each in (value, asked)]
-                raise ValueError(f"{name}={shown[0]}, but spec.{name}={shown[1]}")
+            is_another = getattr(spec, name) not in (None, getattr(self, name))
+            self.refuse_if(is_another, name, f"spec.{name}")
         needs_sapien = uses_sapien(spec.simulator, self.render_preset)
         self.refuse_if(needs_sapien != (self.sapien_version is not None), "sapien_version")
         self._check_stage()
@@ -194,8 +192,7 @@ class EpisodeResult(Record):
             return
         spec = self.spec
         self.refuse_if(self.task_id >= find_suite(spec.suite).num_tasks, "task_id")
-        if spec.task_id not in (None, self.task_id):
-            raise ValueError(f"task_id={self.task_id}, but spec.task_id={spec.task_id}")
+        self.refuse_if(spec.task_id not in (None, self.task_id), "task_id", "spec.task_id")
         if self.target is not None and self.color is not None and spec.suite == "place":
             self.refuse_if(self.task_id != task_id(self.target, self.color), "task_id", "target", "color")
         if self.task_ids is not None:

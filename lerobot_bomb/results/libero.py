@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, ClassVar, Protocol, Self
+from typing import Annotated, Any, ClassVar, Protocol, Self
 
 from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.libero.episode import LIBERO_PROTOCOL_VERSION, LiberoFailure, LiberoSpec
@@ -40,7 +40,7 @@ def describe_numbered_tasks(specs: Sequence[TaskSpec]) -> str:
     return ", ".join(f"{suite} tasks {describe_numbers(ids)}" for suite, ids in numbers.items())
 
 
-def task_flags(specs: Sequence[TaskSpec]) -> dict[str, str | list[int]]:
+def task_flags(specs: Sequence[TaskSpec]) -> dict[str, Any]:
     """Return lerobot-eval's flags, without `--env.`, for the tasks of episodes."""
     numbers = numbers_by_suite(specs)
     return {"task": ",".join(numbers), "task_ids": sorted(set().union(*numbers.values()))}
@@ -96,8 +96,7 @@ class LiberoResult(Record):
         first = records[0]
         width, height = first.image_size.split("x")
         flags = task_flags([each.spec for each in records])
-        flags |= {"control_mode": first.control_mode, "fps": str(first.fps)}
+        flags |= {"control_mode": first.control_mode, "fps": first.fps}
         flags |= {"observation_height": height, "observation_width": width}
         steps = first.spec.max_steps
-        flags |= {} if steps is None else {"episode_length": str(steps)}
-        return [f"--env.type={cls.env_type}", *(f"--env.{name}={value}" for name, value in flags.items())]
+        return cls.env_flags(flags | ({} if steps is None else {"episode_length": steps}))

@@ -76,10 +76,10 @@ class PushTResult(Record):
 
     @classmethod
     def eval_flags(cls, records: Sequence[Self]) -> list[str]:
-        first = records[0]
-        flags = {"instruction": first.spec.instruction, "max_steps": first.spec.max_steps}
-        flags |= {"image_size": first.image_size}
-        return [f"--env.type={cls.env_type}", *(f"--env.{name}={value}" for name, value in flags.items())]
+        spec, image_size = records[0].spec, records[0].image_size
+        return cls.env_flags(
+            {"instruction": spec.instruction, "max_steps": spec.max_steps, "image_size": image_size}
+        )
 
     @classmethod
     def describe_change(cls, pairs: Sequence[tuple[Self, Self]]) -> str:

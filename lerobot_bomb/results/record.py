@@ -23,7 +23,7 @@ from lerobot_bomb.results.origin import (
     installed_version,
     machine_name,
 )
-from lerobot_bomb.results.schema import SHOWN_CHARACTERS, Natural, Quantity
+from lerobot_bomb.results.schema import Natural, Quantity, impossible
 
 NO_VALUE = "-"  # of a measure that these episodes do not have
 MAX_RUNS = 10  # of numbers, in a heading
@@ -131,8 +131,7 @@ class Record(ABC):
         policy, inference = self.policy, self.inference
         if policy is not None and policy.batch_row is not None and policy.batch_size is not None:
             self.refuse_if(policy.batch_row >= policy.batch_size, "policy.batch_row", "policy.batch_size")
-        if self.is_success != (self.failure is None):
-            raise ValueError(f"is_success={self.is_success} with failure={self.failure!r}")
+        self.refuse_if(self.is_success != (self.failure is None), "is_success", "failure")
         self.check_episode()
         self._check_levels()
         if inference is not None:
@@ -147,9 +146,7 @@ class Record(ABC):
     def refuse_if(self, is_impossible: bool, first: str, *others: str) -> None:
         """Raise a ValueError that shows fields that are possible alone, but not together."""
         if is_impossible:
-            values = {name: json.dumps(attrgetter(name)(self)) for name in (first, *others)}
-            shown = [f"{name}={value[:SHOWN_CHARACTERS]}" for name, value in values.items()]
-            raise ValueError(f"{shown[0]} is impossible{' with ' * bool(others)}{', '.join(shown[1:])}")
+            raise impossible({name: attrgetter(name)(self) for name in (first, *others)})
 
     def _check_levels(self) -> None:
         asked = {axis: (low, high) for axis, low, high in self.spec.condition.ranges}
@@ -198,6 +195,14 @@ class Record(ABC):
     @abstractmethod
     def eval_flags(cls, records: Sequence[Self]) -> list[str]:
         """Return lerobot-eval's flags for the environment and tasks of episodes."""
+
+    @classmethod
+    def env_flags(cls, values: Mapping[str, Any]) -> list[str]:
+        """Return lerobot-eval's flags for the environment's type and these settings."""
+        texts = {
+            name: value if isinstance(value, str) else json.dumps(value) for name, value in values.items()
+        }
+        return [f"--env.type={cls.env_type}", *(f"--env.{name}={text}" for name, text in texts.items())]
 
     @classmethod
     def describe_change(cls, pairs: Sequence[tuple[Self, Self]]) -> str:

@@ -101,6 +101,16 @@ def _holds_tuple(hint: Any) -> bool:
     return get_origin(hint) is tuple or any(map(_holds_tuple, get_args(hint)))
 
 
+def impossible(fields: Mapping[str, Any]) -> ValueError:
+    """Return an error that shows a field that is impossible with the others."""
+    texts = {name: json.dumps(value) for name, value in fields.items()}
+    first, *others = [
+        f"{name}={text[:SHOWN_CHARACTERS]}{'...' * (len(text) > SHOWN_CHARACTERS)}"
+        for name, text in texts.items()
+    ]
+    return ValueError(f"{first} is impossible{' with ' * bool(others)}{', '.join(others)}")
+
+
 class Schema[T]:
     """Fields of a dataclass as a JSON object has them.
 
@@ -167,7 +177,4 @@ class Schema[T]:
         return made
 
     def _impossible(self, name: str, value: Any) -> ValueError:
-        shown = json.dumps(value)
-        if len(shown) > SHOWN_CHARACTERS:
-            shown = f"{shown[:SHOWN_CHARACTERS]}..."
-        return ValueError(f"{self._prefix}{name}={shown} is impossible")
+        return impossible({f"{self._prefix}{name}": value})

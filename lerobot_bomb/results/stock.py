@@ -73,15 +73,7 @@ class StockResult(Record):
     def eval_flags(cls, records: Sequence[Self]) -> list[str]:
         flags = {name: value for name, value in records[0].flags.items() if value is not None}
         flags |= task_flags([each.spec for each in records]) if cls.starts_by_number else {}
-        return [
-            f"--env.type={cls.env_type}",
-            *(f"--env.{name}={_flag_value(value)}" for name, value in flags.items()),
-            "--eval.use_async_envs=false",
-        ]
-
-
-def _flag_value(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
+        return [*cls.env_flags(flags), "--eval.use_async_envs=false"]
 
 
 @cache
