@@ -15,7 +15,7 @@ from lerobot_bomb.environments import ENVIRONMENTS
 from lerobot_bomb.results import reading
 from lerobot_bomb.results.bomb import OLD_VERSION, EpisodeResult
 from lerobot_bomb.results.groups import read_results
-from lerobot_bomb.results.means import mean_measure
+from lerobot_bomb.results.measures import mean_measure
 from lerobot_bomb.results.pusht import PushTResult
 from lerobot_bomb.results.reading import parse_record
 from lerobot_bomb.results.record import Record

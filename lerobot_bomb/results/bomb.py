@@ -23,13 +23,15 @@ from lerobot_bomb.bomb.observation import (
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suite import FIRST_VERSION, find_suite
 from lerobot_bomb.bomb.suites import SUITES
-from lerobot_bomb.bootstrap import bca_interval, format_bounds, sums_by
+from lerobot_bomb.bootstrap import bca_interval, sums_by
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.results import schema
+from lerobot_bomb.results.measures import Measure
 from lerobot_bomb.results.origin import NOT_RECORDED, installed_version, json_list, uses_sapien
-from lerobot_bomb.results.record import NO_VALUE, Measure, Record, describe_numbers
+from lerobot_bomb.results.record import Record, describe_numbers
 from lerobot_bomb.results.schema import Count, Quantity
+from lerobot_bomb.stats import format_bounds
 
 OLD_VERSION = "1.0"  # whose records say less
 # outcomes of an episode in which the stone was carried and put down somewhere on the board
@@ -64,15 +66,15 @@ def median_error_mm(records: "Iterable[EpisodeResult]") -> float | None:
     return median(errors) if errors else None
 
 
-def _placement_error(records: "Sequence[EpisodeResult]") -> str:
+def _placement_error(records: "Sequence[EpisodeResult]") -> str | None:
     error_mm = median_error_mm(records)
-    return NO_VALUE if error_mm is None else f"{error_mm:.1f} mm"
+    return None if error_mm is None else f"{error_mm:.1f} mm"
 
 
-def _progress(records: "Sequence[EpisodeResult]") -> str:
+def _progress(records: "Sequence[EpisodeResult]") -> str | None:
     """Return the mean progress of episodes of several moves, as text."""
     shares = [each.progress for each in records if each.target is None and each.progress is not None]
-    return f"{100 * mean(shares):.1f} %" if shares else NO_VALUE
+    return f"{100 * mean(shares):.1f} %" if shares else None
 
 
 @dataclass(frozen=True, kw_only=True)

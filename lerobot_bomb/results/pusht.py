@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Self
 
 import numpy as np
 
-from lerobot_bomb.bootstrap import bca_interval, format_bounds
+from lerobot_bomb.bootstrap import bca_interval
 from lerobot_bomb.pusht.episode import (
     ALMOST_COVERAGE,
     IMAGE_SIZE,
@@ -20,10 +20,11 @@ from lerobot_bomb.pusht.episode import (
 )
 from lerobot_bomb.pusht.perturbations import PushTCondition
 from lerobot_bomb.results import schema
-from lerobot_bomb.results.means import mean_measure
+from lerobot_bomb.results.measures import mean_measure
 from lerobot_bomb.results.origin import describe_versions, installed_versions
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.results.schema import Count
+from lerobot_bomb.stats import format_bounds
 
 # packages that the bits of an episode depend on
 SIMULATOR = ("gym-pusht", "pymunk", "pygame", "opencv-python-headless")

@@ -6,7 +6,7 @@ Simulator workers import this module, so it imports neither torch nor LeRobot.
 import dataclasses
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter
@@ -16,6 +16,7 @@ from lerobot_bomb import __version__
 from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.conditions import AxisCondition
 from lerobot_bomb.results.inference import Inference
+from lerobot_bomb.results.measures import Measure
 from lerobot_bomb.results.origin import (
     NOT_RECORDED,
     Evaluation,
@@ -25,7 +26,6 @@ from lerobot_bomb.results.origin import (
 )
 from lerobot_bomb.results.schema import Natural, Quantity, impossible
 
-NO_VALUE = "-"  # of a measure that these episodes do not have
 MAX_RUNS = 10  # of numbers, in a heading
 
 # fields of a record that say who acted, in which evaluation, and what simulated; the rest is the episode
@@ -47,15 +47,6 @@ class Spec(Protocol):
     def perturbations(self) -> str: ...
     @property
     def condition(self) -> AxisCondition: ...
-
-
-@dataclass(frozen=True)
-class Measure:
-    """A figure of episodes beside their rate of success."""
-
-    name: str
-    value: Callable[[Sequence[Any]], str]  # of records, with its unit
-    note: str = ""  # what it is of
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.pusht.episode import IMAGE_SIZE
 from lerobot_bomb.results import pusht, schema
 from lerobot_bomb.results.libero import SIMULATOR, describe_numbered_tasks, task_flags
-from lerobot_bomb.results.means import mean_measure
+from lerobot_bomb.results.measures import mean_measure
 from lerobot_bomb.results.origin import describe_versions, installed_version
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.results.schema import Natural
