@@ -4,16 +4,18 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
+from lerobot_bomb.results.groups import groups_of, settings_of
 from lerobot_bomb.results.names import policy_key, policy_names
-from lerobot_bomb.results.played import describe_missing_episodes
 from lerobot_bomb.results.reading import check_any, read_records
-from lerobot_bomb.results.record import Record, describe_numbers
+from lerobot_bomb.results.record import Record, Spec, describe_numbers
 from lerobot_bomb.sweep.manifest import NAME, Manifest
 from lerobot_bomb.sweep.store import ERRORS, RESULTS
 
 MAX_SHOWN_DAMAGES = 10
+PER_TASK = ("suite", "task_version")  # settings in which the tasks of one evaluation may differ
 
 
 def check_outputs(inputs: Sequence[Path], outputs: Iterable[Path]) -> None:
@@ -41,9 +43,28 @@ def missing_of_sweep(path: Path, num_records: int) -> str:
 
 
 def missing_of_evaluations(path: Path, records: Sequence[Record]) -> str:
-    """Say how many episodes of an evaluation a file lacks; "" if none, or if its records do not tell."""
-    missing = describe_missing_episodes(records)
-    return missing and f"{path}: {missing}; lerobot-eval was stopped, or still runs"
+    """Say how many episodes of its evaluations a file has; "" if all, or if its records do not tell.
+
+    An evaluation no longer counts once later ones have run each of its episodes again.
+    """
+    kept = {_evaluation_of(each) for group in groups_of(records) for each in group.records}
+    specs: dict[Any, set[Spec]] = {}
+    for record in records:
+        if (key := _evaluation_of(record)) in kept:
+            specs.setdefault(key, set()).add(record.spec)
+    counts = [
+        f"{len(played)} of {evaluation.num_episodes}"
+        for (evaluation, *_), played in specs.items()
+        if evaluation is not None and len(played) < evaluation.num_episodes
+    ]
+    if not counts:
+        return ""
+    return f"{path}: {' and '.join(counts)} episodes played; lerobot-eval was stopped, or still runs"
+
+
+def _evaluation_of(record: Record) -> tuple[Any, ...]:
+    """Return a key that is equal for the records of one evaluation; its first part is the evaluation."""
+    return record.evaluation, *(pair for pair in settings_of(record).items() if pair[0] not in PER_TASK)
 
 
 @dataclass(frozen=True)
