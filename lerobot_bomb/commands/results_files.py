@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
-from lerobot_bomb.results.groups import groups_of, settings_of
+from lerobot_bomb.results.groups import Group, groups_of, settings_of
 from lerobot_bomb.results.names import policy_key, policy_names
 from lerobot_bomb.results.reading import check_any, read_records
 from lerobot_bomb.results.record import Record, Spec, describe_numbers
@@ -71,6 +71,7 @@ def _evaluation_of(record: Record) -> tuple[Any, ...]:
 class ResultsFile:
     """A results file as it was read, without the damaged records."""
 
+    path: Path
     numbered: dict[int, Record]  # by line, from 1
     num_damaged: int
     missing: str  # the episodes of its sweep or evaluation that it lacks; "": none
@@ -78,6 +79,14 @@ class ResultsFile:
     @property
     def records(self) -> list[Record]:
         return [*self.numbered.values()]
+
+
+@dataclass(frozen=True)
+class FileGroups:
+    """A results file, and the groups of its records."""
+
+    file: ResultsFile
+    groups: list[Group]
 
 
 def read_record(path: Path, line: int) -> Record:
@@ -110,7 +119,7 @@ def read_undamaged(path: Path) -> ResultsFile:
     missing = missing_of_sweep(path, len(records)) or missing_of_evaluations(path, records)
     if missing:
         print(missing, file=sys.stderr)
-    return ResultsFile(numbered, len(damages), missing)
+    return ResultsFile(path, numbered, len(damages), missing)
 
 
 def policy_keys(flag: str, names: Sequence[str], records: Sequence[Record]) -> list[str]:
