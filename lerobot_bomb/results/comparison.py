@@ -124,7 +124,7 @@ def compare(
     num_first, num_second = (sum(len(group.records) for group in policy_groups) for policy_groups in groups)
     return Comparisons(
         policies=policies,
-        names=_names(*(each[0] for each in groups), names, across),
+        names=_names(groups[0][0], groups[1][0], names, across),
         conditions=compare_pairs(_by_condition(pairs)),
         num_unpaired=(num_first - len(pairs), num_second - len(pairs)),
     )
