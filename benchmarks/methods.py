@@ -26,9 +26,10 @@ from machine import add_machine_arguments, make_parser, positive, require_idle_m
 from play_pusht import step_s
 from recipes import last_checkpoint, read_recipe, recipe_path
 
-from lerobot_bomb.bootstrap import format_bounds, paired_bootstrap_interval
+from lerobot_bomb.bootstrap import paired_bootstrap_interval
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.stats import format_bounds
 from lerobot_bomb.tables import print_table
 
 RECIPE = "all_suites"
@@ -256,8 +257,8 @@ def _cells(first: list[list[EpisodeResult]], runs: list[list[EpisodeResult]], su
     columns = np.array([(with_first[seed], means[seed]) for seed in means]).T
     ones = np.ones(len(means))
     interval = paired_bootstrap_interval((columns[0], ones), (columns[1], ones))
-    points = None if interval is None else (100 * interval[0], 100 * interval[1])
-    return [rate, each, f"{100 * (columns[1] - columns[0]).mean():+.1f}{format_bounds(points, '+.1f')}"]
+    points = f"{100 * (columns[1] - columns[0]).mean():+.1f}{format_bounds(interval, '+.1f', 100)}"
+    return [rate, each, points]
 
 
 def figures(results: dict[str, list[list[EpisodeResult]]]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from pathlib import Path
 from machine import make_parser, parse_on_idle_machine, positive, print_rows, write_figures
 
 from lerobot_bomb.results.groups import read_results
-from lerobot_bomb.results.record import Record, without_measured
+from lerobot_bomb.results.record import Record
 from lerobot_bomb.sweep.manifest import Manifest, plan
 
 FLAGS = ("--env.type=bomb", "--env.image_size=64", "--policy.device=cpu")
@@ -106,7 +106,7 @@ def run(command: str, flags: Sequence[str]) -> None:
 
 def comparable(rows: list[Record]) -> list[Record]:
     """Return the records in one order, without timings and the evaluation's identity."""
-    same = [replace(without_measured(each), evaluation=None) for each in rows]
+    same = [replace(each, inference=None, evaluation=None) for each in rows]
     return sorted(same, key=lambda record: repr(record.spec))
 
 

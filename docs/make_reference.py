@@ -22,7 +22,7 @@ from lerobot_bomb.commands.table import COMMANDS, PROGRAM
 from lerobot_bomb.conditions import MAX_LEVEL, Axis
 from lerobot_bomb.environments import ENVIRONMENTS
 from lerobot_bomb.policies.config import VlaConfig
-from lerobot_bomb.results.record import Record, field_names
+from lerobot_bomb.results.record import Record
 
 FOLDER = Path(__file__).parent / "reference"
 JSON_KINDS = {bool: "true or false", int: "whole number", float: "number", str: "text", Any: "any"}
@@ -227,6 +227,11 @@ def records_page() -> str:
     return "\n".join(lines)
 
 
+def field_names(cls: Any) -> list[str]:
+    """Return the names of a dataclass's fields."""
+    return [each.name for each in dataclasses.fields(cls)]
+
+
 def nested_in(record_type: type[Record]) -> dict[str, type]:
     """{field of a record that is an object: its type}, without the spec."""
     hints = get_type_hints(record_type, include_extras=True)
@@ -252,8 +257,8 @@ def _dataclass_of(hint: Any) -> Any:
 
 def _rows(cls: Any, prefix: str) -> Iterator[list[str]]:
     hints, comments = get_type_hints(cls, include_extras=True), comments_of(cls)
-    for each in dataclasses.fields(cls):
-        yield [f"`{prefix}.{each.name}`", json_kind(hints[each.name]), comments.get(each.name, "")]
+    for name in field_names(cls):
+        yield [f"`{prefix}.{name}`", json_kind(hints[name]), comments.get(name, "")]
 
 
 def _members(hint: Any) -> list[Any]:

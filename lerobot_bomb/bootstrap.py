@@ -67,11 +67,6 @@ def bca_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float, float
     return float(low), float(high)
 
 
-def format_bounds(interval: tuple[float, float] | None, form: str) -> str:
-    """Format an interval as ' [low, high]'; '' without one."""
-    return "" if interval is None else f" [{interval[0]:{form}}, {interval[1]:{form}}]"
-
-
 @dataclass(frozen=True)
 class Slope:
     """Least-squares slope of a value over levels, with its 95 % interval unless all resamples agree."""
@@ -131,9 +126,19 @@ class Estimate:
     low: float | None
     high: float | None
 
+    @classmethod
+    def of(cls, sums_E: np.ndarray, counts_E: np.ndarray) -> "Estimate":
+        """Estimate sum / count over E episodes."""
+        low, high = bootstrap_interval(sums_E, counts_E) or (None, None)
+        return cls(float(sums_E.sum() / counts_E.sum()), low, high)
+
     def __str__(self) -> str:
-        interval = "" if self.low is None else f" [{self.low:.4g}, {self.high:.4g}]"
-        return f"{self.mean:.4g}{interval}"
+        return self.text(".4g")
+
+    def text(self, form: str) -> str:
+        """Return '0.44 [0.21, 0.67]', or the mean alone, in a format."""
+        interval = "" if self.low is None else f" [{self.low:{form}}, {self.high:{form}}]"
+        return f"{self.mean:{form}}{interval}"
 
 
 def estimate_mean(values_RX: np.ndarray, episode_R: np.ndarray) -> Estimate:
@@ -145,8 +150,7 @@ def estimate_mean(values_RX: np.ndarray, episode_R: np.ndarray) -> Estimate:
     np.add.at(sums_E, place_R, np.where(counts_RX, values_RX, 0.0).sum(axis=1))
     np.add.at(counts_E, place_R, counts_RX.sum(axis=1))
     counted = counts_E > 0
-    low, high = bootstrap_interval(sums_E[counted], counts_E[counted]) or (None, None)
-    return Estimate(float(sums_E.sum() / counts_E.sum()), low, high)
+    return Estimate.of(sums_E[counted], counts_E[counted])
 
 
 def _is_constant(sums_E: np.ndarray, counts_E: np.ndarray) -> bool:

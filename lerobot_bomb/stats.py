@@ -64,6 +64,11 @@ def clustered_interval(successes_C: np.ndarray, counts_C: np.ndarray) -> tuple[f
     return _wilson(float(rate), float(num_effective), float(stdtrit(num_clusters - 1, 0.975)))
 
 
+def format_bounds(interval: tuple[float, float] | None, form: str, unit: float = 1) -> str:
+    """Format an interval as ' [low, high]', times a unit; '' without one."""
+    return "" if interval is None else f" [{unit * interval[0]:{form}}, {unit * interval[1]:{form}}]"
+
+
 @dataclass(frozen=True)
 class Rate:
     """Share of n records that count, such as successes, with its 95 % interval."""
@@ -97,11 +102,15 @@ class Rate:
     @property
     def percent(self) -> str:
         """Text '96.0 % [86.5, 98.9]'."""
-        bounds = ""
-        if self.interval is not None:
-            low, high = self.interval
-            bounds = f" [{100 * low:.1f}, {100 * high:.1f}]"
-        return f"{100 * self.share:.1f} %{bounds}"
+        return self._percent(".1f")
+
+    @property
+    def whole_percent(self) -> str:
+        """Text '96 % [86, 99]'."""
+        return self._percent(".0f")
+
+    def _percent(self, form: str) -> str:
+        return f"{100 * self.share:{form}} %{format_bounds(self.interval, form, 100)}"
 
     def __str__(self) -> str:
         """Format as '48/50 = 96.0 % [86.5, 98.9]'."""

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.envs.vector import NEW_ROLLOUT_OPTION, LazyVectorEnv
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.groups import read_results
-from lerobot_bomb.results.record import without_measured
 from lerobot_env_bomb.env import BombEnv
 
 SMALL = RenderOptions(image_size=32)
@@ -218,7 +217,7 @@ def evaluate(
         patch.setattr(lerobot_eval, "rollout", note)
         run("lerobot-eval", *own.split(), *flags)
     records = read_results(folder / "results.jsonl", EpisodeResult)
-    by_seed = {each.spec.seed: without_measured(each) for each in records}
+    by_seed = {each.spec.seed: replace(each, inference=None) for each in records}
     assert by_seed.keys() == set(range(5, 5 + num_episodes)) <= actions.keys()
     return {seed: Outcome(record, actions[seed]) for seed, record in by_seed.items()}
 

@@ -1,7 +1,7 @@
 """Records that are read: of every release, damaged ones, lines and files that hold none."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -15,17 +15,17 @@ from lerobot_bomb.environments import ENVIRONMENTS
 from lerobot_bomb.results import reading
 from lerobot_bomb.results.bomb import OLD_VERSION, EpisodeResult
 from lerobot_bomb.results.groups import read_results
-from lerobot_bomb.results.means import mean_measure
+from lerobot_bomb.results.measures import mean_measure
 from lerobot_bomb.results.pusht import PushTResult
 from lerobot_bomb.results.reading import parse_record
-from lerobot_bomb.results.record import Record, field_names
+from lerobot_bomb.results.record import Record
 from lerobot_bomb.results.summary import summarise
 
 
 def test_a_record_is_read_as_it_was_written() -> None:
-    written = EpisodeResult(**{name: getattr(read(values(3)), name) for name in field_names(EpisodeResult)})
+    written = EpisodeResult(**vars(read(values(3))))
     assert parse_record(written.to_json().encode()) == written
-    assert [*json.loads(written.to_json())] == [*field_names(EpisodeResult)]
+    assert [*json.loads(written.to_json())] == [each.name for each in fields(EpisodeResult)]
 
 
 def test_all_fields_of_a_release_must_be_there() -> None:
@@ -40,7 +40,7 @@ RECORD_TYPES: list[type[Record]] = [each.record for each in ENVIRONMENTS.values(
 @pytest.mark.parametrize("record_type", RECORD_TYPES)
 def test_what_records_of_earlier_releases_lack_are_fields(record_type: type[Record]) -> None:
     nested = {name.partition(".")[0] for name in record_type.earlier}
-    assert nested <= {*field_names(record_type)}
+    assert nested <= {each.name for each in fields(record_type)}
     assert {name for names in record_type.versions.values() for name in names} <= record_type.earlier.keys()
 
 
@@ -80,7 +80,7 @@ DAMAGED: dict[str, Any] = {
     "placement_error_mm=NaN is impossible": {"placement_error_mm": float("nan")},
     "collateral_mm=-1.0 is impossible": {"collateral_mm": -1.0},
     'failure="bored" is impossible': {"failure": "bored"},
-    "is_success=True with failure='dropped'": {"failure": "dropped", "is_success": True},
+    'is_success=true is impossible with failure="dropped"': {"failure": "dropped", "is_success": True},
     "steps=0 is impossible": {"steps": 0},
     "steps=true is impossible": {"steps": True},
     'stage="released" is impossible': {"stage": "released"},
@@ -96,7 +96,7 @@ DAMAGED: dict[str, Any] = {
     "perturbations": {"spec": asdict(EpisodeSpec(0)) | {"perturbations": "camera:9"}},
     "it lacks spec.robot": {"spec": {k: v for k, v in asdict(EpisodeSpec(0)).items() if k != "robot"}},
     "spec has wind, of which": {"spec": asdict(EpisodeSpec(0)) | {"wind": 3}},
-    "target=[2, 2], but spec.target=[1, 1]": {"spec": asdict(EpisodeSpec(0, target=(1, 1)))},
+    "target=[2, 2] is impossible with spec.target=[1, 1]": {"spec": asdict(EpisodeSpec(0, target=(1, 1)))},
     "protocol_version '0.0'; this package reads 1.0, 1.1, pusht-1.0": {"protocol_version": "0.0"},
 }
 

@@ -102,7 +102,11 @@ def test_a_shipped_policy_is_named_as_on_the_command_line_and_a_given_name_wins(
     shipped = [checkpoint(name, str(shipped_checkpoint(name))) for name in shipped_names()]
     names = [f"bomb:{name}" for name in shipped_names()]
     assert policy_names(shipped) == names
-    assert policy_names([*shipped, checkpoint("act", "x")], {0: "ours"}) == ["ours", *names[1:], "act"]
+    assert policy_names([*shipped, checkpoint("act", "x")], {shipped[0].key: "ours"}) == [
+        "ours",
+        *names[1:],
+        "act",
+    ]
 
 
 OTHER: dict[str, dict[str, Any]] = {

@@ -167,7 +167,7 @@ def test_libero_is_told_apart_by_the_number_that_chooses_the_initial_state() -> 
     assert "--env.task=libero_goal" in flags and "--env.task_ids=[3]" in flags
 
 
-def test_an_env_type_of_which_nothing_is_known_has_success_and_rewards() -> None:
+def test_an_env_type_of_which_nothing_is_known_has_success_and_rewards(tmp_path: Path) -> None:
     rows = list(results_of(info("aloha", 0, [1.0, 0.0]), AlohaEnv(episode_length=9), ACT, 7, 2))
     assert rows == [parse_record(row.to_json().encode()) for row in rows]
     assert [(row.spec.seed, row.max_reward, row.failure) for row in rows] == [(7, 1, None), (8, 0, "failed")]
@@ -175,6 +175,9 @@ def test_an_env_type_of_which_nothing_is_known_has_success_and_rewards() -> None
     assert rows[0].simulator_versions["gymnasium"] and "gym_aloha" not in rows[0].simulator_versions
     flags = rows[0].eval_flags(rows)
     assert flags[0] == "--env.type=aloha" and "--env.episode_length=9" in flags
+    path = tmp_path / "aloha.jsonl"
+    path.write_text("".join(f"{row.to_json()}\n" for row in rows))
+    assert main(["export", str(path), f"--output={tmp_path}"]) == 0
 
 
 @pytest.mark.parametrize(

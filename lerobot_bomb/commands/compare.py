@@ -9,7 +9,8 @@ from lerobot_bomb.files import written_whole
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.report.latex import comparison_table
 from lerobot_bomb.results.comparison import compare
-from lerobot_bomb.results.groups import policy_key, settings_of
+from lerobot_bomb.results.groups import settings_of
+from lerobot_bomb.results.names import policy_key
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.tables import print_lines
 
@@ -80,7 +81,7 @@ def _by_policy(records: list[Record], names: Sequence[str]) -> list[list[Record]
     """Split records by policy: those that are named, or all in order of first appearance."""
     by_key: dict[str, list[Record]] = {}
     for record in records:
-        by_key.setdefault(policy_key(record), []).append(record)
+        by_key.setdefault(policy_key(record.policy), []).append(record)
     return [by_key[key] for key in (policy_keys("--policies", names, records) if names else by_key)]
 
 

@@ -43,18 +43,18 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"--output={output} must be the page's path, .html, or a folder")
     page, tables, rates = (output.with_suffix(suffix) for suffix in (".html", ".json", ".csv"))
     check_outputs(args.paths, (page, tables, rates))
-    files = {path: read_undamaged(path) for path in dict.fromkeys(args.paths)}
-    records = [record for file in files.values() for record in file.records]
+    files = [read_undamaged(path) for path in dict.fromkeys(args.paths)]
+    records = [record for file in files for record in file.records]
     groups = groups_of(records, names_of(args.names, records))
-    numbered = {path: file.numbered for path, file in files.items()}
+    numbered = {file.path: file.numbered for file in files}
     samples = list(sample_failures(groups, numbered, max(NUM_SAMPLES, args.films, args.videos)))
     folder = page.with_name(f"{page.stem}_videos")
     if args.films or args.videos:
         samples = _add_pictures(samples, folder, args.films, args.videos)
-    missing = [file.missing for file in files.values() if file.missing]
+    missing = [file.missing for file in files if file.missing]
     missing += [
-        f"{path}: {file.num_damaged} damaged records are not counted"
-        for path, file in files.items()
+        f"{file.path}: {file.num_damaged} damaged records are not counted"
+        for file in files
         if file.num_damaged
     ]
     report = Report(groups, samples, missing)

@@ -3,14 +3,12 @@
 import argparse
 import shlex
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path
 
 from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.next_steps import print_next
 from lerobot_bomb.commands.results_failures import print_failures
-from lerobot_bomb.commands.results_files import ResultsFile, read_undamaged
+from lerobot_bomb.commands.results_files import FileGroups, ResultsFile, read_undamaged
 from lerobot_bomb.commands.table import PROGRAM
 from lerobot_bomb.report.panels import Series
 from lerobot_bomb.results.comparison import can_compare
@@ -34,15 +32,6 @@ LEGEND = (
 WORDS = ("policy", "suite", "condition")  # columns at the left
 
 
-@dataclass(frozen=True)
-class FileGroups:
-    """A results file, and the groups of its records."""
-
-    path: Path
-    file: ResultsFile
-    groups: list[Group]
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
@@ -58,14 +47,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print rates by condition and the paired changes under perturbations, or the failures."""
-    files = {path: read_undamaged(path) for path in args.paths}
-    for path, file in files.items():
+    files = [read_undamaged(path) for path in dict.fromkeys(args.paths)]
+    for file in files:
         if args.strict and file.num_damaged:
-            raise ValueError(f"{path}: damaged records, which --strict refuses: {file.num_damaged}")
-    names = _policy_names(files.values()) if len(files) > 1 else {}
-    told = [FileGroups(path, file, groups_of(file.records, names)) for path, file in files.items()]
+            raise ValueError(f"{file.path}: damaged records, which --strict refuses: {file.num_damaged}")
+    names = _policy_names(files) if len(files) > 1 else {}
+    told = [FileGroups(file, groups_of(file.records, names)) for file in files]
     if args.failures:
-        print_failures({each.path: (each.file.numbered, each.groups) for each in told})
+        print_failures(told)
         return 0
     _print_rates(told)
     print()
@@ -90,7 +79,7 @@ def _print_rates(told: list[FileGroups]) -> None:
     apart = [*{name: None for each in told for name in differing_otherwise(each.groups)}]
     rows = [
         [
-            *([str(each.path)] if several else []),
+            *([str(each.file.path)] if several else []),
             *(shorten(group.policy), suite_of(group), *(_setting(group, name) for name in apart)),
             *cells,
         ]
@@ -124,18 +113,19 @@ def _setting(group: Group, name: str) -> str:
 def _notes(told: list[FileGroups]) -> Iterator[str]:
     """Yield what is damaged, not compared, or kept apart."""
     for each in told:
+        path = each.file.path
         if each.file.num_damaged:
-            yield f"{each.path}: damaged records, which are not counted: {each.file.num_damaged}"
+            yield f"{path}: damaged records, which are not counted: {each.file.num_damaged}"
         if apart := differing_otherwise(each.groups):
-            yield f"{each.path}: episodes that differ in {', '.join(apart)} are neither pooled nor paired"
+            yield f"{path}: episodes that differ in {', '.join(apart)} are neither pooled nor paired"
         for group in each.groups:
             if unpaired := describe_unpaired(group, each.groups):
-                yield f"{each.path}: {shorten(group.name)}: {unpaired}"
+                yield f"{path}: {shorten(group.name)}: {unpaired}"
 
 
 def _print_details(told: FileGroups) -> None:
     """Print each group's heading, and the measures under each condition."""
-    path = told.path
+    path = told.file.path
     if len(told.groups) > 1:
         print(
             f"{path}: {len(told.groups)} groups of episodes, neither pooled nor paired with each other; they "
@@ -168,7 +158,7 @@ def _are_two_to_compare(told: list[FileGroups]) -> bool:
 
 
 def _next_steps(told: list[FileGroups]) -> Mapping[str, str]:
-    paths = shlex.join(str(each.path) for each in told)
+    paths = shlex.join(str(each.file.path) for each in told)
     groups = [group for each in told for group in each.groups]
     steps: dict[str, str] = {}
     if number := sum(not record.is_success for group in groups for record in group.records):

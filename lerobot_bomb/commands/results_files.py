@@ -4,17 +4,18 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
-from lerobot_bomb.results.groups import policy_key
-from lerobot_bomb.results.names import policy_names
-from lerobot_bomb.results.played import describe_missing_episodes
+from lerobot_bomb.results.groups import Group, groups_of, settings_of
+from lerobot_bomb.results.names import policy_key, policy_names
 from lerobot_bomb.results.reading import check_any, read_records
-from lerobot_bomb.results.record import Record, describe_numbers
+from lerobot_bomb.results.record import Record, Spec, describe_numbers
 from lerobot_bomb.sweep.manifest import NAME, Manifest
 from lerobot_bomb.sweep.store import ERRORS, RESULTS
 
 MAX_SHOWN_DAMAGES = 10
+PER_TASK = ("suite", "task_version")  # settings in which the tasks of one evaluation may differ
 
 
 def check_outputs(inputs: Sequence[Path], outputs: Iterable[Path]) -> None:
@@ -42,15 +43,35 @@ def missing_of_sweep(path: Path, num_records: int) -> str:
 
 
 def missing_of_evaluations(path: Path, records: Sequence[Record]) -> str:
-    """Say how many episodes of an evaluation a file lacks; "" if none, or if its records do not tell."""
-    missing = describe_missing_episodes(records)
-    return missing and f"{path}: {missing}; lerobot-eval was stopped, or still runs"
+    """Say how many episodes of its evaluations a file has; "" if all, or if its records do not tell.
+
+    An evaluation no longer counts once later ones have run each of its episodes again.
+    """
+    kept = {_evaluation_of(each) for group in groups_of(records) for each in group.records}
+    specs: dict[Any, set[Spec]] = {}
+    for record in records:
+        if (key := _evaluation_of(record)) in kept:
+            specs.setdefault(key, set()).add(record.spec)
+    counts = [
+        f"{len(played)} of {evaluation.num_episodes}"
+        for (evaluation, *_), played in specs.items()
+        if evaluation is not None and len(played) < evaluation.num_episodes
+    ]
+    if not counts:
+        return ""
+    return f"{path}: {' and '.join(counts)} episodes played; lerobot-eval was stopped, or still runs"
+
+
+def _evaluation_of(record: Record) -> tuple[Any, ...]:
+    """Return a key that is equal for the records of one evaluation; its first part is the evaluation."""
+    return record.evaluation, *(pair for pair in settings_of(record).items() if pair[0] not in PER_TASK)
 
 
 @dataclass(frozen=True)
 class ResultsFile:
     """A results file as it was read, without the damaged records."""
 
+    path: Path
     numbered: dict[int, Record]  # by line, from 1
     num_damaged: int
     missing: str  # the episodes of its sweep or evaluation that it lacks; "": none
@@ -58,6 +79,14 @@ class ResultsFile:
     @property
     def records(self) -> list[Record]:
         return [*self.numbered.values()]
+
+
+@dataclass(frozen=True)
+class FileGroups:
+    """A results file, and the groups of its records."""
+
+    file: ResultsFile
+    groups: list[Group]
 
 
 def read_record(path: Path, line: int) -> Record:
@@ -90,7 +119,7 @@ def read_undamaged(path: Path) -> ResultsFile:
     missing = missing_of_sweep(path, len(records)) or missing_of_evaluations(path, records)
     if missing:
         print(missing, file=sys.stderr)
-    return ResultsFile(numbered, len(damages), missing)
+    return ResultsFile(path, numbered, len(damages), missing)
 
 
 def policy_keys(flag: str, names: Sequence[str], records: Sequence[Record]) -> list[str]:
@@ -101,8 +130,9 @@ def policy_keys(flag: str, names: Sequence[str], records: Sequence[Record]) -> l
     Raises:
         ValueError: a name fits no policy, or several.
     """
-    first = {policy_key(each): each for each in reversed(records)}
-    first = dict(reversed(first.items()))
+    first: dict[str, Record] = {}
+    for record in records:
+        first.setdefault(policy_key(record.policy), record)
     described = {key: record.describe_policy() for key, record in first.items()}
     short = dict(zip(first, policy_names([each.policy for each in first.values()]), strict=True))
     found = []

@@ -10,8 +10,7 @@ from lerobot.configs import FeatureType
 from lerobot.envs import EnvConfig
 
 from lerobot_bomb.environments import env_type
-from lerobot_bomb.results.origin import PolicyIdentity, installed_versions
-from lerobot_bomb.results.record import NOT_RECORDED
+from lerobot_bomb.results.origin import NOT_RECORDED, PolicyIdentity, installed_versions
 from lerobot_bomb.results.stock import FAILED, StockResult, StockSpec
 
 EVAL_INFO = "eval_info.json"  # in the folder of --output_dir

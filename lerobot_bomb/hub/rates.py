@@ -8,7 +8,7 @@ from lerobot_bomb.report.chart import Chart
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.sections import answer
 from lerobot_bomb.results.groups import Group, by_condition, rate_of
-from lerobot_bomb.results.record import NO_VALUE, Record
+from lerobot_bomb.results.record import Record
 from lerobot_bomb.results.summary import named_counts, summarise
 from lerobot_bomb.stats import Rate
 
@@ -53,7 +53,7 @@ def results_table(group: Group) -> str:
     measures = [
         measure
         for measure in group.record_type.measures
-        if any(summary.measures[measure] != NO_VALUE for summary in summaries.values())
+        if any(measure in summary.measures for summary in summaries.values())
     ]
     intervals = ", ".join(dict.fromkeys(summary.rate.method for summary in summaries.values()))
     names = [f"{measure.name} ({measure.note})" if measure.note else measure.name for measure in measures]
@@ -68,7 +68,7 @@ def results_table(group: Group) -> str:
         cells = [
             f"perturbations={condition}",
             str(summary.rate),
-            *(summary.measures[each] for each in measures),
+            *(summary.measures.get(each, "-") for each in measures),
         ]
         lines.append(f"| {' | '.join(map(plain, [*cells, named_counts(summary.failures)]))} |")
     return "\n".join(lines)
@@ -86,7 +86,7 @@ def mostly_failing(groups: Sequence[Group]) -> list[str]:
 
 def suite_or_task(record: Record) -> str:
     """Return the suite of an episode, or its task where the environment has no suites."""
-    return getattr(record.spec, "suite", record.tasks[0])
+    return getattr(record.spec, "suite", None) or record.tasks[0]
 
 
 def _title(group: Group) -> str:

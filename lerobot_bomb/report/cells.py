@@ -7,7 +7,7 @@ from lerobot_bomb.report.table import Cell
 from lerobot_bomb.results.groups import rate_of
 from lerobot_bomb.results.pairs import PairedComparison
 from lerobot_bomb.results.record import Record
-from lerobot_bomb.stats import format_p
+from lerobot_bomb.stats import format_bounds, format_p
 
 INTERVALS = "95 % Wilson intervals, clustered by seed"  # of `rate`
 
@@ -20,16 +20,15 @@ def rate[R: Record](
         return Cell("-")
     found = rate_of(records, is_counted)
     low, high = found.interval or (None, None)
-    bounds = "" if low is None or high is None else f" [{100 * low:.0f}, {100 * high:.0f}]"
     value = {"successes": found.successes, "n": found.n, "low": low, "high": high}
-    return Cell(f"{100 * found.share:.0f} %{bounds}", value, found.share)
+    return Cell(found.whole_percent, value, found.share)
 
 
 def points(compared: PairedComparison) -> list[Cell]:
     """Return the cells '-12 [-20, -5]', second rate minus first in percentage points, and p-value."""
     counts, (low, high) = compared.counts, compared.interval
     value = {"difference": counts.difference, "low": low, "high": high, **vars(counts)}
-    text = f"{100 * counts.difference:+.0f} [{100 * low:+.0f}, {100 * high:+.0f}]"
+    text = f"{100 * counts.difference:+.0f}{format_bounds(compared.interval, '+.0f', 100)}"
     return [Cell(text, value), Cell(format_p(compared.p_value).removeprefix("p = "), compared.p_value)]
 
 
@@ -37,8 +36,8 @@ def mean_cell(mean: Mean | None, form: str, shade: float | None = None) -> Cell:
     """Return the cell '0.12 [0.10, 0.15]' in a format; '-' without a mean."""
     if mean is None:
         return Cell("-")
-    interval = "" if mean.interval is None else f" [{mean.interval[0]:{form}}, {mean.interval[1]:{form}}]"
-    return Cell(f"{mean.value:{form}}{interval}", {"value": mean.value, "interval": mean.interval}, shade)
+    text = f"{mean.value:{form}}{format_bounds(mean.interval, form)}"
+    return Cell(text, {"value": mean.value, "interval": mean.interval}, shade)
 
 
 def count(number: int, total: int) -> Cell:

@@ -9,7 +9,7 @@ from lerobot_bomb.report.table import Statement
 from lerobot_bomb.results.comparison import Comparisons, describe_verdict
 from lerobot_bomb.results.groups import rate_of, settings_of
 from lerobot_bomb.results.pairs import PairedComparison
-from lerobot_bomb.stats import SIGNIFICANT, Rate, format_p
+from lerobot_bomb.stats import Rate, format_p
 from lerobot_bomb.tables import first_of, in_a_row, shorten
 
 MAX_NAMED = 3  # names in a sentence
@@ -35,13 +35,7 @@ def describe_series(series: Series, panel: Panel) -> Statement:
 
 def in_words(rate: Rate) -> str:
     """Return '198 of 200 (99 % [96, 100])'."""
-    return f"{rate.successes} of {rate.n} ({percent(rate)})"
-
-
-def percent(rate: Rate) -> str:
-    """Return '99 % [96, 100]'; '99 %' without an interval."""
-    bounds = "" if rate.interval is None else f" [{100 * rate.interval[0]:.0f}, {100 * rate.interval[1]:.0f}]"
-    return f"{100 * rate.share:.0f} %{bounds}"
+    return f"{rate.successes} of {rate.n} ({rate.whole_percent})"
 
 
 def _perturbed(series: Series, pooled: Rate) -> str:
@@ -68,7 +62,7 @@ def widest_condition(series: Series) -> AxisCondition | None:
 def _change(compared: PairedComparison) -> str:
     """Return ', 16 points less (p = 0.002)'."""
     test = format_p(compared.p_value)
-    if compared.p_value < SIGNIFICANT:
+    if compared.is_shown:
         return f", {_points(compared)} ({test})"
     return f" (no difference shown: {_points(compared)}, {test})"
 
@@ -88,14 +82,14 @@ def _costs(series: Series) -> Iterator[str]:
         return
     widest = widest_condition(series)
     of_axes = _worst_of_axes(series.costs.values(), () if widest is None else axes_of_condition(widest))
-    shown = [each for each in of_axes if each.p_value < SIGNIFICANT]
+    shown = [each for each in of_axes if each.is_shown]
     lost = [each for each in shown if each.counts.difference < 0]
     won = [each for each in shown if each.counts.difference > 0]
     if lost:
         yield f"It loses most to {_named(lost)}."
     if won:
         yield f"It gains from {_named(won[::-1])}."
-    others = [each for each in of_axes if each.p_value >= SIGNIFICANT]
+    others = [each for each in of_axes if not each.is_shown]
     if others:
         yield _no_difference(others, "other " if shown else "single " if widest else "")
 
@@ -117,7 +111,7 @@ def _worst_of_axes(costs: Iterable[PairedComparison], but: tuple[str, ...]) -> l
 
 
 def _strength(compared: PairedComparison) -> tuple[bool, float]:
-    return compared.p_value >= SIGNIFICANT, compared.counts.difference
+    return not compared.is_shown, compared.counts.difference
 
 
 def _named(costs: Sequence[PairedComparison]) -> str:
@@ -197,7 +191,7 @@ def _is_of(compared: PairedComparison, series: Series) -> bool:
 
 def _perturbed_verdict(found: Sequence[PairedComparison], first: str, second: str) -> str:
     """Say under how many perturbed conditions each is better."""
-    shown = [each for each in found if each.p_value < SIGNIFICANT]
+    shown = [each for each in found if each.is_shown]
     parts = []
     for name, sign in ((first, -1), (second, 1)):
         better = [each for each in shown if sign * each.counts.difference > 0]

@@ -8,7 +8,6 @@ from typing import Annotated, ClassVar, Self
 
 import numpy as np
 
-from lerobot_bomb import __version__
 from lerobot_bomb.bomb.board import BOARD, COLORS, task_id
 from lerobot_bomb.bomb.environment import Environment, numbered_tasks
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec, Failure, Stage
@@ -24,19 +23,15 @@ from lerobot_bomb.bomb.observation import (
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suite import FIRST_VERSION, find_suite
 from lerobot_bomb.bomb.suites import SUITES
-from lerobot_bomb.bootstrap import bca_interval, format_bounds, sums_by
+from lerobot_bomb.bootstrap import bca_interval, sums_by
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.results import schema
-from lerobot_bomb.results.origin import (
-    PolicyIdentity,
-    installed_version,
-    json_list,
-    machine_name,
-    uses_sapien,
-)
-from lerobot_bomb.results.record import NO_VALUE, NOT_RECORDED, Measure, Record, describe_numbers
-from lerobot_bomb.results.schema import Count, Natural, Quantity
+from lerobot_bomb.results.measures import Measure
+from lerobot_bomb.results.origin import NOT_RECORDED, installed_version, json_list, uses_sapien
+from lerobot_bomb.results.record import Record, describe_numbers
+from lerobot_bomb.results.schema import Count, Quantity
+from lerobot_bomb.stats import format_bounds
 
 OLD_VERSION = "1.0"  # whose records say less
 # outcomes of an episode in which the stone was carried and put down somewhere on the board
@@ -71,15 +66,15 @@ def median_error_mm(records: "Iterable[EpisodeResult]") -> float | None:
     return median(errors) if errors else None
 
 
-def _placement_error(records: "Sequence[EpisodeResult]") -> str:
+def _placement_error(records: "Sequence[EpisodeResult]") -> str | None:
     error_mm = median_error_mm(records)
-    return NO_VALUE if error_mm is None else f"{error_mm:.1f} mm"
+    return None if error_mm is None else f"{error_mm:.1f} mm"
 
 
-def _progress(records: "Sequence[EpisodeResult]") -> str:
+def _progress(records: "Sequence[EpisodeResult]") -> str | None:
     """Return the mean progress of episodes of several moves, as text."""
     shares = [each.progress for each in records if each.target is None and each.progress is not None]
-    return f"{100 * mean(shares):.1f} %" if shares else NO_VALUE
+    return f"{100 * mean(shares):.1f} %" if shares else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +123,6 @@ class EpisodeResult(Record):
     steps: Count  # control steps
     # share of the moves that were made; null: not recorded
     progress: Annotated[float | None, lambda value: value is not None and 0 <= value <= 1]
-    is_success: bool
     is_success_bomb_v0: bool  # success by the original benchmark's rule, within 26 mm
     failure: Annotated[str, schema.among(Failure)] | None
     # how far the episode got: start, reached, grasped, lifted, placed
@@ -136,25 +130,19 @@ class EpisodeResult(Record):
     placement_error_mm: Quantity  # horizontal distance of the stone from the target
     nearest_intersection: tuple[Line, Line]  # row and column where the stone is
     collateral_mm: Quantity  # largest distance by which another stone was moved
-    levels: dict[str, Natural] = field(default_factory=dict)
     image_size: Annotated[int, schema.between(MIN_IMAGE_SIZE, MAX_IMAGE_SIZE)] = DEFAULT_IMAGE_SIZE
     # --env.render_preset
     render_preset: Annotated[str, schema.among(RENDER_PRESETS)] = RenderOptions.preset
     # --env.task_ids of the whole evaluation; null: not given
     task_ids: Annotated[tuple[TaskId, ...], lambda value: len(value) > 0] | None = None
-    policy: PolicyIdentity | None = None
     # maker of the OpenGL driver that rendered the images, or Vulkan; null: nothing was rendered
     opengl_vendor: str | None = None
     # the driver's renderer
     opengl_renderer: str | None = None
-    machine: str = field(default_factory=machine_name)
     # installed MuJoCo
     mujoco_version: str | None = field(default_factory=partial(installed_version, "mujoco"))
     # installed SAPIEN; null: it neither simulated nor drew
     sapien_version: str | None = None
-    lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
-    torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
-    package_version: str = __version__
     task_version: str  # version of the suite's episodes
     protocol_version: str = PROTOCOL_VERSION
 
@@ -163,10 +151,8 @@ class EpisodeResult(Record):
         versions = dict.fromkeys((FIRST_VERSION, find_suite(spec.suite).version))
         one_of(f"task_version of suite {spec.suite}", self.task_version, tuple(versions))
         for name in ("target", "color"):
-            asked, value = getattr(spec, name), getattr(self, name)
-            if asked not in (None, value):
-                shown = [list(each) if isinstance(each, tuple) else each for each in (value, asked)]
-                raise ValueError(f"{name}={shown[0]}, but spec.{name}={shown[1]}")
+            is_another = getattr(spec, name) not in (None, getattr(self, name))
+            self.refuse_if(is_another, name, f"spec.{name}")
         needs_sapien = uses_sapien(spec.simulator, self.render_preset)
         self.refuse_if(needs_sapien != (self.sapien_version is not None), "sapien_version")
         self._check_stage()
@@ -208,8 +194,7 @@ class EpisodeResult(Record):
             return
         spec = self.spec
         self.refuse_if(self.task_id >= find_suite(spec.suite).num_tasks, "task_id")
-        if spec.task_id not in (None, self.task_id):
-            raise ValueError(f"task_id={self.task_id}, but spec.task_id={spec.task_id}")
+        self.refuse_if(spec.task_id not in (None, self.task_id), "task_id", "spec.task_id")
         if self.target is not None and self.color is not None and spec.suite == "place":
             self.refuse_if(self.task_id != task_id(self.target, self.color), "task_id", "target", "color")
         if self.task_ids is not None:

@@ -6,8 +6,9 @@ from typing import Any
 
 from lerobot_bomb.results.groups import POLICY, Group, groups_of, rate_of
 from lerobot_bomb.results.names import policy_names
+from lerobot_bomb.results.origin import NOT_RECORDED
 from lerobot_bomb.results.pairs import Pair, PairedComparison, compare_pairs, describe_test, episode_key
-from lerobot_bomb.results.record import NOT_RECORDED, Record
+from lerobot_bomb.results.record import Record
 from lerobot_bomb.stats import format_p
 
 type Values = dict[str, set[str]]  # of settings
@@ -121,20 +122,24 @@ def compare(
     if not pairs:
         raise ValueError(f"no episode is in both: {_why_none(*groups, across)}")
     num_first, num_second = (sum(len(group.records) for group in policy_groups) for policy_groups in groups)
-    chosen = names or {}
-    keys = [policy_groups[0].settings[POLICY] for policy_groups in groups]
-    given = {place: chosen[key] for place, key in enumerate(keys) if key in chosen}
-    first_name, second_name = policy_names([each[0].records[0].policy for each in groups], given)
-    if across is not None:
-        first_name = second_name = policy_names([groups[0][0].records[0].policy], given)[0]
-        values = [each[0].settings[across] for each in groups]
-        first_name, second_name = (f"{first_name}, {across} {value}" for value in values)
     return Comparisons(
         policies=policies,
-        names=(first_name, second_name),
+        names=_names(groups[0][0], groups[1][0], names, across),
         conditions=compare_pairs(_by_condition(pairs)),
         num_unpaired=(num_first - len(pairs), num_second - len(pairs)),
     )
+
+
+def _names(
+    first: Group, second: Group, given: Mapping[str, str] | None, across: str | None
+) -> tuple[str, str]:
+    """Name the sides: by their policies, or across a setting by its values."""
+    a, b = (group.records[0].policy for group in (first, second))
+    if across is None:
+        name, other = policy_names([a, b], given)
+        return name, other
+    (name,) = policy_names([a], given)
+    return f"{name}, {across} {first.settings[across]}", f"{name}, {across} {second.settings[across]}"
 
 
 def _by_condition(pairs: list[tuple[Group, Pair]]) -> dict[str, list[Pair]]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_bomb.bootstrap import Estimate, bootstrap_interval, sums_by
+from lerobot_bomb.bootstrap import Estimate, sums_by
 from lerobot_bomb.results.inference import Inference
 from lerobot_bomb.results.record import Record
 
@@ -50,8 +50,7 @@ def _mean_difference(records: Sequence[Any], order: int) -> Estimate:
     starts = [each.start_key for each in records]
     sums_E, _ = sums_by(counts_N * np.array([getattr(each, f"action_j{order}") for each in records]), starts)
     counts_E, _ = sums_by(counts_N, starts)
-    interval = bootstrap_interval(sums_E, counts_E) or (None, None)
-    return Estimate(float(sums_E.sum() / counts_E.sum()), *interval)
+    return Estimate.of(sums_E, counts_E)
 
 
 def lines(records: Sequence[Record]) -> list[tuple[str, str, str]]:

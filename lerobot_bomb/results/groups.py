@@ -1,15 +1,15 @@
 """Groups of records that may be pooled and paired."""
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
 
 from lerobot_bomb.conditions import NONE, AxisCondition
-from lerobot_bomb.results.names import numbered, policy_names
+from lerobot_bomb.results.names import numbered, policy_key, policy_names
+from lerobot_bomb.results.origin import NOT_RECORDED
 from lerobot_bomb.results.reading import check_any, read_records
-from lerobot_bomb.results.record import NOT_RECORDED, Record, describe_numbers
+from lerobot_bomb.results.record import Record, describe_numbers
 from lerobot_bomb.stats import Rate
 
 POLICY = "policy"  # the one setting that the episodes of two policies may differ in
@@ -114,32 +114,23 @@ def groups_of(records: Iterable[Record], names: Mapping[str, str] | None = None)
 
     `names`: {key of a policy: its name}; the others get the shortest that tell them apart.
     """
-    episodes: dict[tuple[tuple[str, str], ...], dict[Any, Record]] = {}
-    counts = Counter[tuple[tuple[str, str], ...]]()
+    by_settings: dict[tuple[tuple[str, str], ...], list[Record]] = {}
     for record in records:
-        settings = tuple(settings_of(record).items())
-        episodes.setdefault(settings, {})[record.spec] = record
-        counts[settings] += 1
-    groups = [list(each.values()) for each in episodes.values()]
-    by_policy = _policy_names([first for first, *_ in groups], names or {})
-    policies = [by_policy[dict(settings)[POLICY]] for settings in episodes]
+        by_settings.setdefault(tuple(settings_of(record).items()), []).append(record)
+    kept = [[*{each.spec: each for each in several}.values()] for several in by_settings.values()]
+    by_key = {policy_key(first.policy): first.policy for first, *_ in kept}
+    name_of = dict(zip(by_key, policy_names([*by_key.values()], names), strict=True))
+    policies = [name_of[policy_key(first.policy)] for first, *_ in kept]
     group_names = [
         f"{policy}, {suite}" if (suite := getattr(first.spec, "suite", None)) else policy
-        for policy, (first, *_) in zip(policies, groups, strict=True)
+        for policy, (first, *_) in zip(policies, kept, strict=True)
     ]
     return [
-        Group(name, policy, dict(settings), group, counts[settings] - len(group))
-        for name, policy, settings, group in zip(
-            numbered(group_names), policies, episodes, groups, strict=True
+        Group(name, policy, dict(settings), last, len(several) - len(last))
+        for name, policy, (settings, several), last in zip(
+            numbered(group_names), policies, by_settings.items(), kept, strict=True
         )
     ]
-
-
-def _policy_names(records: Sequence[Record], given: Mapping[str, str]) -> dict[str, str]:
-    """Return {key of a policy: its name}."""
-    by_key = {policy_key(each): each.policy for each in records}
-    chosen = {place: given[key] for place, key in enumerate(by_key) if key in given}
-    return dict(zip(by_key, policy_names([*by_key.values()], chosen), strict=True))
 
 
 def policies_of(groups: Iterable[Group]) -> list[Policy]:
@@ -153,17 +144,12 @@ def policies_of(groups: Iterable[Group]) -> list[Policy]:
 def settings_of(record: Record) -> dict[str, str]:
     """Return the settings that must be equal in episodes that are pooled or paired."""
     return {
-        POLICY: policy_key(record),
+        POLICY: policy_key(record.policy),
         "protocol": record.protocol_version,
         "image_size": str(record.image_size),
         **record.settings(),
         **{name: str(value) for name, value in sorted(_fixed(record).items())},
     }
-
-
-def policy_key(record: Record) -> str:
-    """Return a key that is equal for the same weights with the same settings."""
-    return NOT_RECORDED if record.policy is None else record.policy.key
 
 
 def differing(groups: list[Group]) -> list[str]:

@@ -3,20 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, ClassVar, Protocol, Self
+from typing import Annotated, Any, ClassVar, Protocol, Self
 
-from lerobot_bomb import __version__
 from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.libero.episode import LIBERO_PROTOCOL_VERSION, LiberoFailure, LiberoSpec
 from lerobot_bomb.libero.perturbations import LiberoCondition
 from lerobot_bomb.results import schema
-from lerobot_bomb.results.origin import (
-    PolicyIdentity,
-    describe_versions,
-    installed_version,
-    installed_versions,
-    machine_name,
-)
+from lerobot_bomb.results.origin import describe_versions, installed_versions
 from lerobot_bomb.results.record import Record, describe_numbers
 from lerobot_bomb.results.schema import Count, Natural
 
@@ -47,7 +40,7 @@ def describe_numbered_tasks(specs: Sequence[TaskSpec]) -> str:
     return ", ".join(f"{suite} tasks {describe_numbers(ids)}" for suite, ids in numbers.items())
 
 
-def task_flags(specs: Sequence[TaskSpec]) -> dict[str, str | list[int]]:
+def task_flags(specs: Sequence[TaskSpec]) -> dict[str, Any]:
     """Return lerobot-eval's flags, without `--env.`, for the tasks of episodes."""
     numbers = numbers_by_suite(specs)
     return {"task": ",".join(numbers), "task_ids": sorted(set().union(*numbers.values()))}
@@ -68,19 +61,12 @@ class LiberoResult(Record):
     instruction: str  # text that the policy read
     initial_state: Natural  # number of the task's recorded state in which the episode started
     steps: Count  # control steps
-    is_success: bool
     failure: Annotated[str, schema.among(LiberoFailure)] | None
-    levels: dict[str, Natural] = field(default_factory=dict)
     image_size: str = "256x256"
     control_mode: str = "relative"  # --env.control_mode
     fps: Count = 20  # control steps per second
-    policy: PolicyIdentity | None = None
     # {package on which the bits of an episode depend: its version}
     simulator_versions: dict[str, str | None] = field(default_factory=partial(installed_versions, SIMULATOR))
-    machine: str = field(default_factory=machine_name)
-    lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
-    torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
-    package_version: str = __version__
     protocol_version: str = LIBERO_PROTOCOL_VERSION
 
     def check_episode(self) -> None:
@@ -110,8 +96,7 @@ class LiberoResult(Record):
         first = records[0]
         width, height = first.image_size.split("x")
         flags = task_flags([each.spec for each in records])
-        flags |= {"control_mode": first.control_mode, "fps": str(first.fps)}
+        flags |= {"control_mode": first.control_mode, "fps": first.fps}
         flags |= {"observation_height": height, "observation_width": width}
         steps = first.spec.max_steps
-        flags |= {} if steps is None else {"episode_length": str(steps)}
-        return [f"--env.type={cls.env_type}", *(f"--env.{name}={value}" for name, value in flags.items())]
+        return cls.env_flags(flags | ({} if steps is None else {"episode_length": steps}))

@@ -4,27 +4,35 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
-from lerobot_bomb.results.origin import PolicyIdentity
+from lerobot_bomb.results.origin import NOT_RECORDED, PolicyIdentity
 
 UNKNOWN = "policy not recorded"
 SHIPPED_PREFIX = "bomb:"  # of the names of checkpoints that come with the package
 SHIPPED_FOLDER = re.compile(r"(?:^|/)lerobot_bomb/checkpoints/weights/([^/]+)/?$")
 SHOWN_DIGITS = 6  # of a SHA-256, where names are the same otherwise
 
+# makes a part of a name for each of several policies, which tells them apart
+type Parts = Callable[[Sequence[PolicyIdentity]], list[str]]
+
+
+def policy_key(policy: PolicyIdentity | None) -> str:
+    """Return a key that is equal for the same weights with the same settings."""
+    return NOT_RECORDED if policy is None else policy.key
+
 
 def policy_names(
-    policies: Sequence[PolicyIdentity | None], given: Mapping[int, str] | None = None
+    policies: Sequence[PolicyIdentity | None], given: Mapping[str, str] | None = None
 ) -> list[str]:
     """Name each policy: its type or `bomb:NAME`; of one type, also the parts of their paths that differ.
 
-    `given`: {place in `policies`: its name}.
+    `given`: {key of a policy: its name}.
     """
-    names = [_base(each) for each in policies]
-    names = _extended(names, policies, _path_parts)
-    for part in (_interventions, _weights, _settings):
-        names = _extended(names, policies, lambda several, part=part: [part(each) for each in several])
+    known = [each or PolicyIdentity(UNKNOWN) for each in policies]
+    names = [shipped_name(each.path or "") or each.type for each in known]
+    for parts in (_path_parts, _interventions, _weights, _settings):
+        names = _extended(names, known, parts)
     chosen = given or {}
-    return numbered([chosen.get(place, name) for place, name in enumerate(names)])
+    return numbered([chosen.get(policy_key(each), name) for each, name in zip(policies, names, strict=True)])
 
 
 def numbered(names: Sequence[str]) -> list[str]:
@@ -38,23 +46,13 @@ def numbered(names: Sequence[str]) -> list[str]:
     return told
 
 
-def _base(policy: PolicyIdentity | None) -> str:
-    if policy is None:
-        return UNKNOWN
-    return shipped_name(policy.path or "") or policy.type
-
-
 def shipped_name(path: str) -> str | None:
     """Return `bomb:NAME` for the folder of a shipped checkpoint, on any machine; None for any other path."""
     found = SHIPPED_FOLDER.search(path)
     return f"{SHIPPED_PREFIX}{found[1]}" if found else None
 
 
-def _extended(
-    names: list[str],
-    policies: Sequence[PolicyIdentity | None],
-    parts: Callable[[list[PolicyIdentity | None]], list[str]],
-) -> list[str]:
+def _extended(names: list[str], policies: Sequence[PolicyIdentity], parts: Parts) -> list[str]:
     """Add a part to every name that several policies have."""
     extended = list(names)
     for name, number in Counter(names).items():
@@ -65,9 +63,9 @@ def _extended(
     return extended
 
 
-def _path_parts(policies: Sequence[PolicyIdentity | None]) -> list[str]:
+def _path_parts(policies: Sequence[PolicyIdentity]) -> list[str]:
     """Return the parts of the policies' paths between those that all begin and end with."""
-    paths = [((each and each.path) or "").strip("/").split("/") for each in policies]
+    paths = [(each.path or "").strip("/").split("/") for each in policies]
     first = _num_shared(paths)
     paths = [path[first:] for path in paths]
     last = _num_shared([path[::-1] for path in paths])
@@ -84,13 +82,13 @@ def _num_shared(paths: Sequence[Sequence[str]]) -> int:
     return number
 
 
-def _interventions(policy: PolicyIdentity | None) -> str:
-    return "" if policy is None else " ".join(f"with {name}" for name in policy.interventions)
+def _interventions(policies: Sequence[PolicyIdentity]) -> list[str]:
+    return [" ".join(f"with {name}" for name in each.interventions) for each in policies]
 
 
-def _weights(policy: PolicyIdentity | None) -> str:
-    return "" if policy is None else (policy.weights_sha256 or "")[:SHOWN_DIGITS]
+def _weights(policies: Sequence[PolicyIdentity]) -> list[str]:
+    return [(each.weights_sha256 or "")[:SHOWN_DIGITS] for each in policies]
 
 
-def _settings(policy: PolicyIdentity | None) -> str:
-    return "" if policy is None else (policy.settings_sha256 or "")[:SHOWN_DIGITS]
+def _settings(policies: Sequence[PolicyIdentity]) -> list[str]:
+    return [(each.settings_sha256 or "")[:SHOWN_DIGITS] for each in policies]

@@ -14,6 +14,7 @@ from typing import Any
 
 from lerobot_bomb.results.schema import Count, Natural, Sha256
 
+NOT_RECORDED = "not recorded"
 SHOWN_DIGITS = 12  # of a SHA-256
 
 

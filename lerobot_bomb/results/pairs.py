@@ -10,6 +10,7 @@ from lerobot_bomb.stats import (
     SIGNIFICANT,
     PairedCounts,
     episodes_to_tell_apart,
+    format_bounds,
     holm,
     paired_difference_interval,
 )
@@ -51,8 +52,7 @@ class PairedComparison:
 
     def describe_difference(self, unit: str = "") -> str:
         """Return '+25.0 [+3.8, +46.9]': second rate minus first in percentage points."""
-        low, high = self.interval
-        return f"{100 * self.counts.difference:+.1f}{unit} [{100 * low:+.1f}, {100 * high:+.1f}]"
+        return f"{100 * self.counts.difference:+.1f}{unit}{format_bounds(self.interval, '+.1f', 100)}"
 
     def describe_change(self) -> str:
         """Describe how the second records differ, apart from successes; '' if they do not."""

@@ -7,8 +7,7 @@ from typing import Annotated, ClassVar, Self
 
 import numpy as np
 
-from lerobot_bomb import __version__
-from lerobot_bomb.bootstrap import bca_interval, format_bounds
+from lerobot_bomb.bootstrap import bca_interval
 from lerobot_bomb.pusht.episode import (
     ALMOST_COVERAGE,
     IMAGE_SIZE,
@@ -21,16 +20,11 @@ from lerobot_bomb.pusht.episode import (
 )
 from lerobot_bomb.pusht.perturbations import PushTCondition
 from lerobot_bomb.results import schema
-from lerobot_bomb.results.means import mean_measure
-from lerobot_bomb.results.origin import (
-    PolicyIdentity,
-    describe_versions,
-    installed_version,
-    installed_versions,
-    machine_name,
-)
+from lerobot_bomb.results.measures import mean_measure
+from lerobot_bomb.results.origin import describe_versions, installed_versions
 from lerobot_bomb.results.record import Record
-from lerobot_bomb.results.schema import Count, Natural
+from lerobot_bomb.results.schema import Count
+from lerobot_bomb.stats import format_bounds
 
 # packages that the bits of an episode depend on
 SIMULATOR = ("gym-pusht", "pymunk", "pygame", "opencv-python-headless")
@@ -55,19 +49,12 @@ class PushTResult(Record):
     instruction: str  # text that the policy read
     goal_pose: tuple[float, float, float]  # target: x and y in pixels of the board, radians
     steps: Count  # control steps
-    is_success: bool
     failure: Annotated[str, schema.among(PushTFailure)] | None
     coverage: Coverage  # share of the target that the block covers at the end
     max_coverage: Coverage  # largest coverage after any step
-    levels: dict[str, Natural] = field(default_factory=dict)
     image_size: Annotated[int, schema.between(MIN_IMAGE_SIZE, MAX_IMAGE_SIZE)] = IMAGE_SIZE
-    policy: PolicyIdentity | None = None
     # {package on which the bits of an episode depend: its version}
     simulator_versions: dict[str, str | None] = field(default_factory=partial(installed_versions, SIMULATOR))
-    machine: str = field(default_factory=machine_name)
-    lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
-    torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
-    package_version: str = __version__
     protocol_version: str = PUSHT_PROTOCOL_VERSION
 
     def check_episode(self) -> None:
@@ -90,10 +77,10 @@ class PushTResult(Record):
 
     @classmethod
     def eval_flags(cls, records: Sequence[Self]) -> list[str]:
-        first = records[0]
-        flags = {"instruction": first.spec.instruction, "max_steps": first.spec.max_steps}
-        flags |= {"image_size": first.image_size}
-        return [f"--env.type={cls.env_type}", *(f"--env.{name}={value}" for name, value in flags.items())]
+        spec, image_size = records[0].spec, records[0].image_size
+        return cls.env_flags(
+            {"instruction": spec.instruction, "max_steps": spec.max_steps, "image_size": image_size}
+        )
 
     @classmethod
     def describe_change(cls, pairs: Sequence[tuple[Self, Self]]) -> str:

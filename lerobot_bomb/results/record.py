@@ -6,20 +6,26 @@ Simulator workers import this module, so it imports neither torch nor LeRobot.
 import dataclasses
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from operator import attrgetter
 from typing import Any, ClassVar, Protocol, Self
 
+from lerobot_bomb import __version__
 from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.conditions import AxisCondition
 from lerobot_bomb.results.inference import Inference
-from lerobot_bomb.results.origin import Evaluation, PolicyIdentity
-from lerobot_bomb.results.schema import SHOWN_CHARACTERS, Natural, Quantity
+from lerobot_bomb.results.measures import Measure
+from lerobot_bomb.results.origin import (
+    NOT_RECORDED,
+    Evaluation,
+    PolicyIdentity,
+    installed_version,
+    machine_name,
+)
+from lerobot_bomb.results.schema import Natural, Quantity, impossible
 
-NOT_RECORDED = "not recorded"
-NO_VALUE = "-"  # of a measure that these episodes do not have
 MAX_RUNS = 10  # of numbers, in a heading
 
 # fields of a record that say who acted, in which evaluation, and what simulated; the rest is the episode
@@ -43,21 +49,12 @@ class Spec(Protocol):
     def condition(self) -> AxisCondition: ...
 
 
-@dataclass(frozen=True)
-class Measure:
-    """A figure of episodes beside their rate of success."""
-
-    name: str
-    value: Callable[[Sequence[Any]], str]  # of records, with its unit
-    note: str = ""  # what it is of
-
-
 @dataclass(frozen=True, kw_only=True)
 class Record(ABC):
     """Result of an episode.
 
-    A subclass for each environment names all fields, in the order in which they are written; those that it
-    does not name come last. Reading checks a field by its type. A new field goes into `earlier`.
+    A subclass for each environment adds its own fields. Reading checks a field by its type. A new field goes
+    into `earlier`.
     """
 
     env_type: ClassVar[str]
@@ -90,13 +87,16 @@ class Record(ABC):
     spec: Spec
     is_success: bool  # the episode succeeded
     failure: str | None  # failure class; null: success
-    levels: dict[str, Natural]  # {perturbation axis that was on: its level}
+    # {perturbation axis that was on: its level}
+    levels: dict[str, Natural] = field(default_factory=dict)
     image_size: int | str  # width and height of the images in pixels
-    policy: PolicyIdentity | None  # policy that acted; null: not known
-    machine: str  # processor and C library
-    lerobot_version: str | None  # installed LeRobot
-    torch_version: str | None  # installed torch
-    package_version: str  # version of this package
+    policy: PolicyIdentity | None = None  # policy that acted; null: not known
+    machine: str = field(default_factory=machine_name)  # processor and C library
+    # installed LeRobot
+    lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
+    # installed torch
+    torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
+    package_version: str = __version__  # version of this package
     protocol_version: str  # how results are measured and written
     # mean length of the executed actions' second differences, gripper left out; null: fewer than four actions
     action_j2: Quantity | None = None
@@ -106,9 +106,8 @@ class Record(ABC):
     evaluation: Evaluation | None = None  # evaluation that it is of; null: not recorded, or of none
 
     def as_json(self) -> dict[str, Any]:
-        """Return the fields in the order of a record."""
-        values = dataclasses.asdict(self)
-        return {name: values[name] for name in field_names(type(self))}
+        """Return the fields as a JSON object."""
+        return dataclasses.asdict(self)
 
     def to_json(self) -> str:
         """Return the record, a line of JSON.
@@ -123,8 +122,7 @@ class Record(ABC):
         policy, inference = self.policy, self.inference
         if policy is not None and policy.batch_row is not None and policy.batch_size is not None:
             self.refuse_if(policy.batch_row >= policy.batch_size, "policy.batch_row", "policy.batch_size")
-        if self.is_success != (self.failure is None):
-            raise ValueError(f"is_success={self.is_success} with failure={self.failure!r}")
+        self.refuse_if(self.is_success != (self.failure is None), "is_success", "failure")
         self.check_episode()
         self._check_levels()
         if inference is not None:
@@ -139,9 +137,7 @@ class Record(ABC):
     def refuse_if(self, is_impossible: bool, first: str, *others: str) -> None:
         """Raise a ValueError that shows fields that are possible alone, but not together."""
         if is_impossible:
-            values = {name: json.dumps(attrgetter(name)(self)) for name in (first, *others)}
-            shown = [f"{name}={value[:SHOWN_CHARACTERS]}" for name, value in values.items()]
-            raise ValueError(f"{shown[0]} is impossible{' with ' * bool(others)}{', '.join(shown[1:])}")
+            raise impossible({name: attrgetter(name)(self) for name in (first, *others)})
 
     def _check_levels(self) -> None:
         asked = {axis: (low, high) for axis, low, high in self.spec.condition.ranges}
@@ -192,22 +188,17 @@ class Record(ABC):
         """Return lerobot-eval's flags for the environment and tasks of episodes."""
 
     @classmethod
+    def env_flags(cls, values: Mapping[str, Any]) -> list[str]:
+        """Return lerobot-eval's flags for the environment's type and these settings."""
+        texts = {
+            name: value if isinstance(value, str) else json.dumps(value) for name, value in values.items()
+        }
+        return [f"--env.type={cls.env_type}", *(f"--env.{name}={text}" for name, text in texts.items())]
+
+    @classmethod
     def describe_change(cls, pairs: Sequence[tuple[Self, Self]]) -> str:
         """Describe how the second records of pairs differ, apart from successes; '' if they do not."""
         return ""
-
-
-@cache
-def field_names(record_type: type[Record]) -> tuple[str, ...]:
-    """Return the names of the fields in the order in which they are written."""
-    known = {each.name for each in dataclasses.fields(record_type)}
-    named = (name for base in record_type.__mro__ for name in vars(base).get("__annotations__", ()))
-    return tuple(dict.fromkeys(name for name in named if name in known))
-
-
-def without_measured[R: Record](record: R) -> R:
-    """Return a record without the fields that change when its episode is run again."""
-    return replace(record, **dict.fromkeys(MEASURED))
 
 
 def outcome_fields(record: Record) -> list[str]:
@@ -218,8 +209,8 @@ def outcome_fields(record: Record) -> list[str]:
     missing = object()
     return [
         name
-        for name in field_names(type(record))
-        if name not in ORIGIN | MEASURED and getattr(record, name) != record.earlier.get(name, missing)
+        for name, value in vars(record).items()
+        if name not in ORIGIN | MEASURED and value != record.earlier.get(name, missing)
     ]
 
 

@@ -84,13 +84,6 @@ def check_of(hint: Any) -> Check:
     raise TypeError(f"no JSON value is checked against {hint}")
 
 
-def _types_without_check(hint: Any) -> frozenset[type]:
-    """Return the types whose JSON values always pass the check, so that it need not be called."""
-    some = _without_none(hint)
-    bare = frozenset({some} & {bool, int, str})
-    return bare if some is hint else bare | {NoneType}
-
-
 def _without_none(hint: Any) -> Any:
     """X | None -> X; other types as they are."""
     members = [each for each in get_args(hint) if each is not NoneType]
@@ -99,6 +92,16 @@ def _without_none(hint: Any) -> Any:
 
 def _holds_tuple(hint: Any) -> bool:
     return get_origin(hint) is tuple or any(map(_holds_tuple, get_args(hint)))
+
+
+def impossible(fields: Mapping[str, Any]) -> ValueError:
+    """Return an error that shows a field that is impossible with the others."""
+    texts = {name: json.dumps(value) for name, value in fields.items()}
+    first, *others = [
+        f"{name}={text[:SHOWN_CHARACTERS]}{'...' * (len(text) > SHOWN_CHARACTERS)}"
+        for name, text in texts.items()
+    ]
+    return ValueError(f"{first} is impossible{' with ' * bool(others)}{', '.join(others)}")
 
 
 class Schema[T]:
@@ -125,7 +128,7 @@ class Schema[T]:
             if dataclasses.is_dataclass(some := _without_none(hint)) and isinstance(some, type)
         }
         flat = {each: hint for each, hint in types.items() if each not in self._nested}
-        self._checks = [(each, _types_without_check(hint), check_of(hint)) for each, hint in flat.items()]
+        self._checks = {each: check_of(hint) for each, hint in flat.items()}
         self._tuples = [each for each, hint in flat.items() if _holds_tuple(hint)]
         absent = {each: lacking[self._prefix + each] for each in types if self._prefix + each in lacking}
         self._start = {each: absent.get(each) for each in types}
@@ -143,10 +146,10 @@ class Schema[T]:
             missing = [f"{self._prefix}{each}" for each in self._required if each not in values]
             raise ValueError(f"it lacks {', '.join(missing)}")
         found: dict[str, Any] = {**self._start}
-        for name, passing, is_possible in self._checks:
+        for name, is_possible in self._checks.items():
             if name in values:
                 found[name] = value = values[name]
-                if type(value) not in passing and not is_possible(value):
+                if not is_possible(value):
                     raise self._impossible(name, value)
         for name in self._tuples:
             if found[name] is not None:
@@ -167,7 +170,4 @@ class Schema[T]:
         return made
 
     def _impossible(self, name: str, value: Any) -> ValueError:
-        shown = json.dumps(value)
-        if len(shown) > SHOWN_CHARACTERS:
-            shown = f"{shown[:SHOWN_CHARACTERS]}..."
-        return ValueError(f"{self._prefix}{name}={shown} is impossible")
+        return impossible({f"{self._prefix}{name}": value})

@@ -2,18 +2,17 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, make_dataclass
-from functools import cache, partial
+from dataclasses import dataclass, make_dataclass
+from functools import cache
 from typing import Annotated, Any, ClassVar, Self
 
-from lerobot_bomb import __version__
 from lerobot_bomb.conditions import NONE, AxisCondition, PerturbedSpec
 from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.pusht.episode import IMAGE_SIZE
 from lerobot_bomb.results import pusht, schema
 from lerobot_bomb.results.libero import SIMULATOR, describe_numbered_tasks, task_flags
-from lerobot_bomb.results.means import mean_measure
-from lerobot_bomb.results.origin import PolicyIdentity, describe_versions, installed_version, machine_name
+from lerobot_bomb.results.measures import mean_measure
+from lerobot_bomb.results.origin import describe_versions, installed_version
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.results.schema import Natural
 
@@ -54,18 +53,10 @@ class StockResult(Record):
     spec: StockSpec
     sum_reward: float  # sum of the rewards
     max_reward: float  # largest reward
-    is_success: bool
     failure: Annotated[str, schema.among((FAILED,))] | None
     image_size: str
     flags: dict[str, Any]  # {flag of the environment that decides what an episode is: its value}
     simulator_versions: dict[str, str | None]  # {package of the simulator: its version}
-    protocol_version: str
-    policy: PolicyIdentity | None = None
-    levels: dict[str, Natural] = field(default_factory=dict)  # always empty: there are no axes
-    machine: str = field(default_factory=machine_name)
-    lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
-    torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
-    package_version: str = __version__
 
     def settings(self) -> dict[str, str]:
         flags = {name: json.dumps(value) for name, value in sorted(self.flags.items()) if value is not None}
@@ -82,15 +73,7 @@ class StockResult(Record):
     def eval_flags(cls, records: Sequence[Self]) -> list[str]:
         flags = {name: value for name, value in records[0].flags.items() if value is not None}
         flags |= task_flags([each.spec for each in records]) if cls.starts_by_number else {}
-        return [
-            f"--env.type={cls.env_type}",
-            *(f"--env.{name}={_flag_value(value)}" for name, value in flags.items()),
-            "--eval.use_async_envs=false",
-        ]
-
-
-def _flag_value(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
+        return [*cls.env_flags(flags), "--eval.use_async_envs=false"]
 
 
 @cache

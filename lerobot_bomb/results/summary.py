@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 from lerobot_bomb.results import efficiency
 from lerobot_bomb.results.groups import Group, differing, rate_of
+from lerobot_bomb.results.measures import Measure
 from lerobot_bomb.results.pairs import PairedComparison, compare_pairs, describe_test, pair_with_nominal
-from lerobot_bomb.results.record import NO_VALUE, Measure, Record
+from lerobot_bomb.results.record import Record
 from lerobot_bomb.stats import Rate, format_p
 
 
@@ -16,18 +17,14 @@ class Summary:
     """Summary of episodes of one environment."""
 
     rate: Rate
-    measures: dict[Measure, str]  # and their values
+    measures: dict[Measure, str]  # that the episodes have, and their values
     failures: Counter[str]
     efficiency: list[tuple[str, str, str]]  # name, value and note of what was measured
 
     def lines(self) -> list[str]:
         """Return the summary as lines of text."""
         figures = [("success", str(self.rate), self.rate.method)]
-        figures += [
-            (measure.name, value, measure.note)
-            for measure, value in self.measures.items()
-            if value != NO_VALUE
-        ]
+        figures += [(measure.name, value, measure.note) for measure, value in self.measures.items()]
         figures += [("failures", named_counts(self.failures), ""), *self.efficiency]
         return [f"{name:<16} {value}{f' ({note})' if note else ''}" for name, value, note in figures]
 
@@ -37,11 +34,17 @@ def named_counts(counts: Counter[str]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.most_common()) or "none"
 
 
+def measured(records: list[Record]) -> dict[Measure, str]:
+    """Return {measure that the episodes have: its value}."""
+    values = {measure: measure.value(records) for measure in records[0].measures}
+    return {measure: value for measure, value in values.items() if value is not None}
+
+
 def summarise(records: list[Record]) -> Summary:
     """Summarise episodes of one environment."""
     return Summary(
         rate=rate_of(records),
-        measures={measure: measure.value(records) for measure in records[0].measures},
+        measures=measured(records),
         failures=Counter(each.failure for each in records if each.failure is not None),
         efficiency=efficiency.lines(records),
     )

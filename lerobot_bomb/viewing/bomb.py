@@ -22,7 +22,7 @@ from lerobot_bomb.bomb.suite import specs_of_tasks
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.rollout import Moment, expert_agent, make_env, run_episode
 from lerobot_bomb.results.bomb import EpisodeResult
-from lerobot_bomb.results.record import NOT_RECORDED
+from lerobot_bomb.results.origin import NOT_RECORDED
 from lerobot_bomb.viewing.episode import EXPERT, RANDOM, EnvView, Viewed
 from lerobot_bomb.viewing.sheet import FONT_SIZE, GAP, INK, TILE_PAPER, font, text_tile
 

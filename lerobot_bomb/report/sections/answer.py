@@ -8,10 +8,9 @@ from lerobot_bomb.report.panels import Panel, Series
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.sentences import describe_comparison, describe_ranking, describe_series
 from lerobot_bomb.report.table import MAX_TOLD, Cell, Section, Statement, Table
-from lerobot_bomb.results.groups import Group
 from lerobot_bomb.results.pairs import PairedComparison, describe_test
-from lerobot_bomb.results.record import NO_VALUE, Measure
-from lerobot_bomb.stats import SIGNIFICANT, Rate
+from lerobot_bomb.results.summary import measured
+from lerobot_bomb.stats import Rate
 
 TITLE = "Success"
 RATE_LABEL = "success, per cent"
@@ -130,7 +129,7 @@ def _cost_dot(found: PairedComparison | None) -> Dot | None:
     if found is None:
         return None
     low, high = found.interval
-    return Dot(100 * found.counts.difference, 100 * low, 100 * high, found.p_value < SIGNIFICANT)
+    return Dot(100 * found.counts.difference, 100 * low, 100 * high, found.is_shown)
 
 
 def _summary(report: Report) -> Table:
@@ -140,22 +139,15 @@ def _summary(report: Report) -> Table:
         _kind, shared = panel.shared
         for place, series in enumerate(panel.series):
             group = series.group
-            measures = _measures(group)
-            notes |= {measure.name: measure.note for measure, _ in measures}
+            measures = measured(group.nominal or group.records)
+            notes |= {measure.name: measure.note for measure in measures}
             cells = [rate(group.nominal), rate(group.perturbed)]
             cells.append(rate(shared[place]) if len(panel.series) > 1 and shared else Cell("-"))
-            told = ", ".join(f"{measure.name} {value}" for measure, value in measures)
+            told = ", ".join(f"{measure.name} {value}" for measure, value in measures.items())
             total = len(group.records)
             rows.append([Cell(group.name), *cells, Cell(told), Cell(str(total), total)])
     note = "; ".join([SUMMARY_NOTE, *(f"{name}: {told}" for name, told in notes.items() if told)])
     return Table("", header, rows, f"{note}.")
-
-
-def _measures(group: Group) -> list[tuple[Measure, str]]:
-    """Return the measures that have a value for the group's episodes, with that value."""
-    records = group.nominal or group.records
-    values = [(measure, measure.value(records)) for measure in group.record_type.measures]
-    return [(measure, value) for measure, value in values if value != NO_VALUE]
 
 
 def conditions(series: Series) -> Table:

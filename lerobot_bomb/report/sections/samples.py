@@ -5,7 +5,6 @@ from html import escape
 from lerobot_bomb.report.page import film_figure
 from lerobot_bomb.report.report import Report, Sample
 from lerobot_bomb.report.table import Cell, Section, Table
-from lerobot_bomb.results.record import NO_VALUE
 from lerobot_bomb.tables import shorten
 
 TITLE = "Failures to look at"
@@ -71,7 +70,7 @@ def _row(sample: Sample) -> list[Cell]:
         Cell(sample.record.failure or ""),
         Cell(spec.perturbations),
         Cell(str(spec.seed), spec.seed),
-        Cell(getattr(sample.record, "instruction", NO_VALUE)),
+        Cell(getattr(sample.record, "instruction", "-")),
         Cell(sample.command),
         Cell(sample.explanation),
         Cell(sample.note, sample.video or sample.note, video=sample.video),
