@@ -16,25 +16,47 @@ import argparse
 import json
 import os
 import shutil
+import subprocess
 import sys
+import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
 
+import numpy as np
 from machine import make_parser, parse_on_idle_machine, positive, write_figures
-from pusht_commands import convert, evaluate, train
-from pusht_report import over_episodes
 from recipes import FOLDER, last_checkpoint, read_recipe, recipe_path
 
+from lerobot_bomb.bootstrap import bootstrap_interval
+from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.tables import print_table
 
+REPO_ID = "lerobot_bomb/pusht"
+MAX_COVERAGE_REWARD = 0.95  # coverage from which gym-pusht's reward is 1
 FIRST_UNSEEN_SEED = 100_000
 COPIES = 7  # of each demonstration
 CALIBRATION_STEPS = {"cpu": (5, 35), "cuda": (100, 400)}
 # of a batch that fills a GPU, read by processes of their own
 ON = {"cpu": ["--num_workers=0"], "cuda": ["--num_workers=2", "--batch_size=128"]}
 POLICIES = sorted(path.stem.removeprefix("play_pusht_") for path in FOLDER.glob("play_pusht_*.yaml"))
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Seconds that a training took, by the clock and of CPU."""
+
+    clock: float
+    cpu: float
+
+    def on(self, device: str) -> float:
+        """Return the seconds that count on a device: of CPU on a CPU, else by the clock."""
+        return self.cpu if device == "cpu" else self.clock
+
+    def minutes(self) -> dict[str, float]:
+        """Return both in minutes, ready for JSON."""
+        return {"minutes": self.clock / 60, "cpu_minutes": self.cpu / 60}
 
 
 @dataclass(frozen=True)
@@ -95,6 +117,52 @@ def compete(args: argparse.Namespace, name: str, dataset: Path) -> Contender:
     )
 
 
+def convert(source: Path | None, dataset: Path, copies: int = 0) -> Path:
+    """Convert the demonstrations, and so many rigid copies of each, to a LeRobotDataset in a folder."""
+    if not dataset.exists():
+        if source is None:
+            raise RuntimeError(f"{dataset} does not exist yet; name the demonstrations with --source")
+        resume = ["--resume"] if dataset.with_name(f"{dataset.name}.conversion").exists() else []
+        flags = [f"--repo_id={REPO_ID}", f"--root={dataset}", f"--copies={copies}", *resume]
+        run_command("lerobot-bomb", "convert", "pusht-zarr", str(source), *flags)
+    return dataset
+
+
+def train(output_dir: Path, flags: list[str]) -> Seconds:
+    """Run stock `lerobot-train`; return the seconds that it took."""
+    started = time.monotonic()
+    cpu_s = run_logged(output_dir.with_suffix(".log"), "lerobot-train", *flags, f"--output_dir={output_dir}")
+    return Seconds(time.monotonic() - started, cpu_s)
+
+
+def evaluate(checkpoint: Path, output_dir: Path, flags: list[str]) -> tuple[list[float], int]:
+    """Run stock `lerobot-eval --env.type=pusht`; return the episodes' maximal coverages and successes."""
+    info = output_dir / "eval_info.json"
+    if not info.exists():
+        shutil.rmtree(output_dir, ignore_errors=True)
+        stock = [f"--policy.path={checkpoint}", "--env.type=pusht", "--eval.use_async_envs=false"]
+        log = output_dir.with_name("eval.log")
+        run_logged(log, "lerobot-eval", *stock, *flags, f"--output_dir={output_dir}")
+    metrics = [task["metrics"] for task in json.loads(info.read_text())["per_task"]]
+    coverages = [MAX_COVERAGE_REWARD * reward for each in metrics for reward in each["max_rewards"]]
+    return coverages, sum(sum(each["successes"]) for each in metrics)
+
+
+def run_logged(log: Path, command: str, *flags: str) -> float:
+    """Run a command of this Python's environment, log its output; return its processes' CPU seconds."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    print(f"{log.parent.name}: {command} {' '.join(flags[:2])} ... > {log}", flush=True)
+    with log.open("w") as output:
+        process = subprocess.Popen(
+            [Path(sys.executable).with_name(command), *flags], stdout=output, stderr=output
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise RuntimeError(f"`{command}` ended with exit code {process.returncode}; see {log}")
+    return usage.ru_utime + usage.ru_stime
+
+
 def steps_flags(steps: int) -> list[str]:
     """Return the flags of a training of so many steps with three checkpoints."""
     return [f"--steps={steps}", f"--save_freq={-(-steps // 3)}"]
@@ -131,6 +199,13 @@ def print_contenders(contenders: list[Contender]) -> None:
             for each in sorted(contenders, key=lambda each: -fmean(each.max_coverages))
         ],
     )
+
+
+def over_episodes(values: Sequence[float]) -> str:
+    """Format the mean and its bootstrap interval."""
+    interval = bootstrap_interval(np.array(values), np.ones(len(values)))
+    text = "" if interval is None else f" [{interval[0]:.3f}, {interval[1]:.3f}]"
+    return f"{fmean(values):.3f}{text} over {len(values)} episodes"
 
 
 if __name__ == "__main__":

@@ -8,8 +8,6 @@ import yaml
 FOLDER = Path(__file__).parents[1] / "configs"
 # every policy type that learns comes with such a file; every proof runs on all of them
 POLICY_TYPES = sorted(path.stem.removeprefix("overfit_") for path in FOLDER.glob("overfit_*.yaml"))
-# policy types with a recipe for PushT
-PUSHT_TYPES = sorted(path.stem.removeprefix("pusht_") for path in FOLDER.glob("pusht_*.yaml"))
 
 
 def recipe_path(task: str, policy_type: str) -> Path:
