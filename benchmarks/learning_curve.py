@@ -5,8 +5,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import cv2
-import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
 
 from lerobot_bomb.bomb.episode import Failure, Stage
 from lerobot_bomb.results.bomb import EpisodeResult, is_grounded, put_down
@@ -16,10 +16,7 @@ from lerobot_bomb.tables import print_table
 NEAR_MM = 20.0
 LIFTED = (Stage.LIFTED, Stage.PLACED)
 
-PANEL_PX = (520, 360)  # width, height of the plot's inside
-MARGIN_PX = (70, 70)  # left and right, top and bottom
-INK, GRID, BAND = (40, 40, 40), (225, 225, 225), (235, 215, 190)  # blue, green, red
-SUCCESS_BGR, GROUNDED_BGR, LIFTED_BGR = (160, 80, 20), (40, 140, 40), (60, 60, 200)
+SUCCESS, GROUNDED, LIFTED_COLOR, BAND = "#1450a0", "#288c28", "#c83c3c", "#bed7eb"
 
 
 @dataclass(frozen=True)
@@ -70,29 +67,26 @@ def as_figures(points: dict[str, Point]) -> dict[str, Any]:
 
 def draw(points: list[Point], title: str, path: Path) -> None:
     """Write a PNG: rates over CPU minutes of training, the success rate with its interval."""
-    plot = np.full((PANEL_PX[1] + 2 * MARGIN_PX[1], PANEL_PX[0] + 2 * MARGIN_PX[0], 3), 255, dtype=np.uint8)
-    end = max(point.cpu_minutes for point in points)
-    _draw_axes(plot, title, end)
-    for point in points:
-        low, high = wilson_interval(point.num_successes, point.num_episodes)
-        across = point.cpu_minutes / end
-        cv2.line(plot, _place(across, low), _place(across, high), BAND, 7)
+    figure = Figure(figsize=(6.6, 4.8), layout="constrained")
+    axes = figure.subplots()
+    minutes = [point.cpu_minutes for point in points]
+    intervals = [wilson_interval(point.num_successes, point.num_episodes) for point in points]
+    axes.vlines(minutes, *zip(*intervals, strict=True), color=BAND, linewidth=6)
     curves = {
-        "lifted": ([p.num_lifted / p.num_episodes for p in points], LIFTED_BGR),
-        "right intersection": ([p.num_grounded / p.num_episodes for p in points], GROUNDED_BGR),
-        "success (within 10 mm)": ([p.num_successes / p.num_episodes for p in points], SUCCESS_BGR),
+        "lifted": ([point.num_lifted for point in points], LIFTED_COLOR),
+        "right intersection": ([point.num_grounded for point in points], GROUNDED),
+        "success (within 10 mm)": ([point.num_successes for point in points], SUCCESS),
     }
-    for number, (name, (shares, color)) in enumerate(curves.items()):
-        places = [_place(p.cpu_minutes / end, share) for p, share in zip(points, shares, strict=True)]
-        thickness = 2 * (len(curves) - number)  # the later ones are drawn over the others, where they agree
-        cv2.polylines(plot, [np.array(places)], False, color, thickness, cv2.LINE_AA)
-        for place in places:
-            cv2.circle(plot, place, 2 + thickness, color, -1, cv2.LINE_AA)
-        legend = (MARGIN_PX[0] + number * PANEL_PX[0] // len(curves), plot.shape[0] - 10)
-        _write(plot, name, legend, color)
+    for number, (name, (counts, color)) in enumerate(curves.items()):
+        rates = [count / point.num_episodes for count, point in zip(counts, points, strict=True)]
+        width = 2 * (len(curves) - number)  # the later ones are drawn over the others, where they agree
+        axes.plot(minutes, rates, marker="o", color=color, linewidth=width, label=name)
+    axes.yaxis.set_major_formatter(PercentFormatter(1))
+    axes.set(title=title, xlabel="CPU minutes of training", xlim=(0, None), ylim=(-0.02, 1.02))
+    axes.grid(axis="y", color="#e1e1e1")
+    axes.legend(loc="lower right")
     path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), plot):
-        raise OSError(f"{path} cannot be written")
+    figure.savefig(path)
 
 
 def _cells(point: Point) -> list[str]:
@@ -106,24 +100,3 @@ def _cells(point: Point) -> list[str]:
         format_rate(point.num_precise, point.num_grounded) if point.num_grounded else "-",
         "-" if error_mm is None else f"{error_mm:.1f} mm",
     ]
-
-
-def _place(across: float, up: float) -> tuple[int, int]:
-    """Pixel of shares of the plot's width and height."""
-    return round(MARGIN_PX[0] + across * PANEL_PX[0]), round(MARGIN_PX[1] + (1 - up) * PANEL_PX[1])
-
-
-def _draw_axes(plot: np.ndarray, title: str, end_minutes: float) -> None:
-    for tenths in range(0, 11, 2):
-        up, across = tenths / 10, tenths / 10
-        cv2.line(plot, _place(0, up), _place(1, up), GRID, 1)
-        _write(plot, f"{10 * tenths} %", (MARGIN_PX[0] - 58, _place(0, up)[1] + 5), INK)
-        x = _place(across, 0)[0]
-        _write(plot, f"{across * end_minutes:.1f}", (x - 14, MARGIN_PX[1] + PANEL_PX[1] + 20), INK)
-    cv2.rectangle(plot, _place(0, 0), _place(1, 1), INK, 1)
-    _write(plot, title, (MARGIN_PX[0], MARGIN_PX[1] - 18), INK)
-    _write(plot, "CPU minutes of training", (_place(0.35, 0)[0], plot.shape[0] - 32), INK)
-
-
-def _write(plot: np.ndarray, text: str, place: tuple[int, int], color: tuple[int, int, int]) -> None:
-    cv2.putText(plot, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.48, color, 1, cv2.LINE_AA)

@@ -11,7 +11,7 @@ import learn
 import learning_tasks
 import numpy as np
 import pytest
-from learning_curve import SUCCESS_BGR, count, draw
+from learning_curve import SUCCESS, count, draw
 from result_rows import read, values
 
 from lerobot_bomb.bomb.board import COLORS
@@ -253,7 +253,8 @@ def test_the_plot_shows_a_curve_that_rises(tmp_path: Path) -> None:
     draw(points, "title", tmp_path / "new" / "curve.png")
     plot = cv2.imread(str(tmp_path / "new" / "curve.png"))
     assert plot is not None
-    lines, columns = np.nonzero((plot == SUCCESS_BGR).all(axis=2))
+    blue_green_red = [*bytes.fromhex(SUCCESS[1:])][::-1]
+    lines, columns = np.nonzero((plot == blue_green_red).all(axis=2))
     first, last = columns.argmin(), columns.argmax()
     assert columns[last] - columns[first] > plot.shape[1] / 3
     assert lines[first] - lines[last] > plot.shape[0] / 2
