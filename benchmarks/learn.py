@@ -39,7 +39,7 @@ from learning_tasks import (
     by_what_is_left_out,
     shown_pairs,
 )
-from machine import add_machine_arguments, positive, require_idle_machine, write_figures
+from machine import make_parser, parse_with_policy_flags, positive, require_idle_machine, write_figures
 from recipes import POLICY_TYPES, last_checkpoint, read_recipe, recipe_path
 
 from lerobot_bomb.checkpoints.identity import sha256_of
@@ -65,7 +65,7 @@ NO_IMAGES, OTHER_INSTRUCTION = "blank images", "another episode's instruction"
 
 def main() -> None:
     """Record, train, evaluate every checkpoint, print the curve; exit with code 1 if the bar is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("task", choices=TASKS)
     types = [PROBE, *POLICY_TYPES, *RIVALS]
     parser.add_argument("--policy.type", dest="policy_type", choices=types, default=PROBE)
@@ -77,11 +77,7 @@ def main() -> None:
     seeds = f"of the evaluations (default: {FIRST_UNSEEN_SEED})"
     parser.add_argument("--first_seed", type=positive, default=FIRST_UNSEEN_SEED, help=seeds)
     parser.add_argument("--plot", type=Path, help="write the learning curve to this PNG")
-    add_machine_arguments(parser)
-    args, args.policy_flags = parser.parse_known_args()
-    unknown = [flag for flag in args.policy_flags if not flag.startswith("--policy.")]
-    if unknown:
-        parser.error(f"unknown: {' '.join(unknown)}")
+    args = parse_with_policy_flags(parser)
     require_idle_machine(args.force)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     here = str(Path(__file__).parent)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from learn import FIRST_UNSEEN_SEED, REPO_ID, evaluate, locked, merge, record, run_record
 from learning_tasks import Part, Task
-from machine import add_machine_arguments, make_parser, positive, require_idle_machine, write_figures
+from machine import make_parser, parse_on_idle_machine, positive, write_figures
 from play_pusht import step_s
 from recipes import last_checkpoint, read_recipe, recipe_path
 
@@ -122,9 +122,7 @@ def main() -> None:
     )
     parser.add_argument("--seeds", type=positive, default=3, help="trainings of each version (default: 3)")
     parser.add_argument("--episodes", type=positive, default=100, help="of a suite, each (default: 100)")
-    add_machine_arguments(parser)
-    args = parser.parse_args()
-    require_idle_machine(args.force)
+    args = parse_on_idle_machine(parser)
     args.output_dir.mkdir(parents=True, exist_ok=True)
     wanted = list(dict.fromkeys(name for part in args.only for name in PARTS[part].values()))
     with locked(args.output_dir):

@@ -16,7 +16,6 @@ The recipe is configs/overfit_TYPE.yaml. A policy that reads the state passes su
 
 import argparse
 import os
-import re
 import signal
 import sys
 import tempfile
@@ -26,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from machine import add_machine_arguments, finish, make_parser, positive, require_idle_machine
+from machine import finish, make_parser, parse_with_policy_flags, positive, require_idle_machine
 from recipes import POLICY_TYPES, last_checkpoint, read_recipe, recipe_path
 
 from lerobot_bomb.bomb.episode import EpisodeSpec, Failure
@@ -80,11 +79,7 @@ def main() -> None:
     parser.add_argument("--steps", type=positive, help="training steps (default: the recipe's)")
     depth = "record and show depth, and train with --policy.depth_source=observation"
     parser.add_argument("--depth", action="store_true", help=depth)
-    add_machine_arguments(parser)
-    args, args.policy_flags = parser.parse_known_args()
-    unknown = [flag for flag in args.policy_flags if not re.fullmatch(r"--policy\.\w+=.*", flag)]
-    if unknown:
-        parser.error(f"unknown: {' '.join(unknown)}; flags for lerobot-train are --policy.NAME=VALUE")
+    args = parse_with_policy_flags(parser)
     if args.output_dir is not None and args.output_dir.exists():
         parser.error(f"--output_dir={args.output_dir} exists already; name a new folder or delete it")
     if args.depth:

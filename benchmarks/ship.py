@@ -5,10 +5,10 @@
 The weights are the training's own, bit for bit; the configs lose the paths of the machine.
 """
 
-import argparse
 import shutil
 from pathlib import Path
 
+from machine import make_parser
 from recipes import last_checkpoint
 
 from lerobot_bomb.checkpoints.identity import sha256_of
@@ -20,7 +20,7 @@ from lerobot_bomb.hub.push import portable_json
 
 def main() -> None:
     """Copy the last checkpoint in place of the one that is there; print its hash and size."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="--output_dir of learn.py")
     args = parser.parse_args()
     checkpoint = last_checkpoint(args.folder / "train")
