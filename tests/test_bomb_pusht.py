@@ -272,7 +272,7 @@ def test_results_are_a_line_per_episode_that_the_command_summarises(
         ({"failure": "dropped"}, "failure=\"dropped\" is impossible"),
         ({"goal_pose": [1, 2]}, "goal_pose=[1, 2] is impossible"),
         ({"spec": vars(PushTSpec(5)) | {"perturbations": "camera:3"}}, "'camera' is not an axis"),
-        ({"is_success": True}, "is_success=True with failure="),
+        ({"is_success": True}, "is_success=true is impossible with failure="),
     ],
 )  # fmt: skip
 def test_a_damaged_line_is_named(

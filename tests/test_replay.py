@@ -76,7 +76,7 @@ def test_a_record_is_run_again_bit_for_bit(
     for line in (1, 2):
         output = f"--output={tmp_path / str(line)}"
         assert main(["replay", str(path), f"--line={line}", output, *of_policy]) == 0
-        assert "as recorded, bit for bit: spec, instruction, " in capsys.readouterr().out
+        assert "as recorded, bit for bit: spec, is_success, failure, " in capsys.readouterr().out
 
 
 def test_flags_of_the_evaluation_are_given_again(
