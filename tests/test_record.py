@@ -73,11 +73,12 @@ def stand_still(state: PrivilegedState) -> np.ndarray:
 
 
 def misplace_white(state: PrivilegedState) -> np.ndarray:
-    """Put white stones down 2 cm from their place: that fails, and sooner than standing still."""
-    (goal,) = state.goals
-    if state.stone_is_white[goal.stone]:
-        state = replace(state, goals=(replace(goal, xyz=goal.xyz + np.array([0.02, 0, 0])),))
-    return expert_action(state)
+    """Put white stones down 2 cm from their places: that fails, and sooner than standing still."""
+    off = {True: np.array([0.02, 0, 0]), False: np.zeros(3)}
+    goals = [
+        replace(each, xyz=each.xyz + off[bool(state.stone_is_white[each.stone])]) for each in state.goals
+    ]
+    return expert_action(replace(state, goals=tuple(goals)))
 
 
 @pytest.mark.parametrize("recording", [VIDEO, IMAGES], ids=["video", "images"])
