@@ -61,7 +61,7 @@ def test_what_cannot_be_merged_is_refused(
 ) -> None:
     write_dataset(tmp_path / "other", partial(numbers, 1), size=16)
     refused = {
-        "differ in features, so they cannot be one dataset": ([folders[0], tmp_path / "other"], "new"),
+        "differ in observation.images.wrist, so": ([folders[0], tmp_path / "other"], "new"),
         "holds no meta/info.json": ([folders[0], tmp_path], "new"),
         "exists; give a new folder": (folders, "other"),
     }

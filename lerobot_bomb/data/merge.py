@@ -26,9 +26,13 @@ def merge_datasets(folders: Sequence[Path], repo_id: str, root: Path) -> tuple[i
     metas = [read_meta(repo_id, folder) for folder in folders]
     first = metas[0]
     for folder, meta in zip(folders, metas, strict=True):
-        for name in ("fps", "robot_type", "features"):
-            if getattr(meta, name) != getattr(first, name):
-                raise ValueError(f"{folder} and {folders[0]} differ in {name}, so they cannot be one dataset")
+        names = [name for name in ("fps", "robot_type") if getattr(meta, name) != getattr(first, name)]
+        both = {**first.features, **meta.features}
+        names += [key for key in both if meta.features.get(key) != first.features.get(key)]
+        if names:
+            raise ValueError(
+                f"{folder} and {folders[0]} differ in {', '.join(names)}, so they cannot be one dataset"
+            )
     features = {key: value for key, value in first.features.items() if key not in DEFAULT_FEATURES}
     arrays = [key for key, value in features.items() if len(value["shape"]) == 2]
     robot: Any = first.robot_type  # None in datasets of others
