@@ -29,11 +29,8 @@ from typing import Any
 
 from learning_curve import Point, as_figures, count, draw, print_points
 from learning_tasks import (
-    DEMONSTRATIONS,
-    OWN,
     PROBE,
     RIVALS,
-    SCENES,
     TASKS,
     Bar,
     Part,
@@ -120,7 +117,7 @@ def run_claimed(args: argparse.Namespace, task: Task, run: dict[str, Any]) -> in
     """Run the whole task in its folder, which nothing else writes to; return 0 if the bar was reached."""
     folder, training = args.output_dir, task.trainings[args.policy_type]
     demonstrations = run["demonstrations"]
-    record(task, demonstrations, folder / "dataset", start_of(run))
+    record(task, demonstrations, folder / "dataset")
     minutes = train(folder, run)
 
     results = evaluate_checkpoints(task, folder, args.first_seed, run["steps"])
@@ -211,27 +208,17 @@ def locked(folder: Path) -> Iterator[None]:
         yield
 
 
-def start_of(run: dict[str, Any]) -> str | None:
-    """Return the checkpoint that a run trains on from: its flag's, or its recipe's; None: there is none."""
-    flag = "--policy.path="
-    given = [each.removeprefix(flag) for each in run["flags"] if each.startswith(flag)]
-    if given or run["policy"] not in POLICY_TYPES:
-        return given[-1] if given else None
-    return read_recipe(recipe_task(run["task"]), run["policy"])["policy"].get("path")
-
-
-def record(task: Task, demonstrations: int, dataset: Path, start: str | None = None) -> None:
-    """Record the expert's episodes, or record and merge a task's parts; `start` runs its own episodes."""
+def record(task: Task, demonstrations: int, dataset: Path) -> None:
+    """Record the expert's episodes, or record and merge the parts of a task."""
     if dataset.exists():
         return
     if not task.parts:
-        part = Part(task.suite, demonstrations, task_ids=task_ids_of(task), perturbations=task.perturbations)
-        run_record(task, dataset, part)
+        run_record(task, dataset, Part(task.suite, demonstrations, task_ids=task_ids_of(task)))
         return
     folders = [dataset.with_name(part.name) for part in task.parts]
     for part, folder in zip(task.parts, folders, strict=True):
         if not folder.exists():
-            run_record(task, folder, part, "--pointing", *([f"--policy.path={start}"] * (part.kind == OWN)))
+            run_record(task, folder, part, "--pointing")
     merge(folders, dataset)
 
 
@@ -249,11 +236,9 @@ def task_ids_of(task: Task) -> tuple[int, ...]:
 
 def run_record(task: Task, folder: Path, part: Part, *flags: str) -> None:
     """Make one recording of the task."""
-    number = {
-        DEMONSTRATIONS: [f"--episodes={part.number}", f"--noise={NOISE}"],
-        SCENES: [f"--static={part.number}"],
-        OWN: [f"--episodes={part.number}", "--relabel"],
-    }[part.kind]
+    number = (
+        [f"--static={part.number}"] if part.is_static else [f"--episodes={part.number}", f"--noise={NOISE}"]
+    )
     task_flags = [f"--task_ids={list(part.task_ids)}"] if part.task_ids else []
     resume = ["--resume"] if folder.with_name(f"{folder.name}.recording").exists() else []
     run_command(
@@ -264,7 +249,7 @@ def run_record(task: Task, folder: Path, part: Part, *flags: str) -> None:
         f"--seed={part.first_seed}",
         *number,
         f"--task={part.suite}",
-        f"--perturbations={part.perturbations}",
+        f"--perturbations={task.perturbations}",
         f"--split={'train' if task.is_partial else 'all'}",
         "--images",
         f"--image_size={IMAGE_SIZE}",

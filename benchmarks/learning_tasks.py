@@ -16,8 +16,6 @@ PROBE = "keypoint_probe"
 RIVALS = ("act", "diffusion")  # LeRobot's; they read no instruction
 FIRST_SEED = 200_000  # of the demonstrations; LeRobot evaluates from 1000 on
 SHOWN, SEVERAL = "as in the demonstrations", "several left out"
-DEMONSTRATIONS, SCENES, OWN = "shown", "scenes", "own"  # kinds of recordings, as their folders are named
-LEVELS = f"{ALL}:0-4"  # of robust policies' recordings
 # targets of the split 'train' that no demonstration gives a stone of the colour: one per row and column
 LEFT_OUT_PAIRS = {
     "black": ((0, 0), (1, 2), (2, 1), (3, 4), (4, 3)),
@@ -44,24 +42,19 @@ class Training:
 
 @dataclass(frozen=True)
 class Part:
-    """One recording of a task's merged dataset: so many demonstrations, static scenes, or own episodes.
-
-    A policy's own episodes are relabelled by the expert.
-    """
+    """One recording of a task's merged dataset: so many demonstrations, or static scenes."""
 
     suite: str
     number: int
-    kind: str = DEMONSTRATIONS
+    is_static: bool = False
     task_ids: tuple[int, ...] = ()  # of the suite, each from every seed; empty: drawn for each episode
     first_seed: int = FIRST_SEED
-    perturbations: str = NONE
 
     @property
     def name(self) -> str:
         """Name of the recording's folder."""
         tasks = f"_tasks_{'_'.join(map(str, self.task_ids))}" if self.task_ids else ""
-        perturbed = "" if self.perturbations == NONE else "_perturbed"
-        return f"{self.kind}_{self.suite}{tasks}{perturbed}"
+        return f"{'scenes' if self.is_static else 'shown'}_{self.suite}{tasks}"
 
 
 @dataclass(frozen=True)
@@ -84,13 +77,13 @@ class Task:
 
 # Places named by a relation take many boards to learn, those with a name of their own only a few.
 ALL_SUITES = (
-    Part("spatial", 48_000, SCENES, task_ids=(0, 1, 2, 3, 4, 11)),
-    Part("spatial", 4_000, SCENES, task_ids=(5, 6, 7, 8, 9, 10)),
-    Part("long", 24_000, SCENES, task_ids=(0, 1, 2, 6, 7, 10, 11, 12)),
-    Part("long", 12_000, SCENES),
-    Part("goal", 14_000, SCENES),
-    Part("object", 14_000, SCENES),
-    Part("place", 5_000, SCENES),
+    Part("spatial", 48_000, is_static=True, task_ids=(0, 1, 2, 3, 4, 11)),
+    Part("spatial", 4_000, is_static=True, task_ids=(5, 6, 7, 8, 9, 10)),
+    Part("long", 24_000, is_static=True, task_ids=(0, 1, 2, 6, 7, 10, 11, 12)),
+    Part("long", 12_000, is_static=True),
+    Part("goal", 14_000, is_static=True),
+    Part("object", 14_000, is_static=True),
+    Part("place", 5_000, is_static=True),
     Part("spatial", 200),
     Part("object", 150),
     Part("long", 130),
@@ -122,7 +115,7 @@ TASKS = {
         (),
         episodes=200,
         trainings={name: Training(3600, None) for name in POLICY_TYPES},
-        perturbations=LEVELS,
+        perturbations=f"{ALL}:0-4",
         conditions=(*(f"{axis}:3" for axis in NUISANCES), f"{ALL}:1", f"{ALL}:3", f"{ALL}:5"),
     ),
     "left_out": Task(
@@ -137,7 +130,7 @@ TASKS = {
         (),
         episodes=100,
         trainings={
-            name: Training(sum(part.number for part in ALL_SUITES if part.kind == DEMONSTRATIONS), None)
+            name: Training(sum(part.number for part in ALL_SUITES if not part.is_static), None)
             for name in POLICY_TYPES
         },
         suite=ALL,

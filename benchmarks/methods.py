@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from learn import FIRST_UNSEEN_SEED, REPO_ID, evaluate, locked, merge, record, run_record
-from learning_tasks import OWN, SCENES, Part, Task
+from learning_tasks import Part, Task
 from machine import make_parser, parse_on_idle_machine, positive, write_figures
 from play_pusht import step_s
 from recipes import last_checkpoint, read_recipe, recipe_path
@@ -35,7 +35,7 @@ from lerobot_bomb.tables import print_table
 RECIPE = "all_suites"
 SUITES = "place", "spatial"
 FIRST_TRAINING_SEED = 1000
-STATIC = Part("spatial", 16_000, SCENES), Part("place", 4_000, SCENES)
+SCENES = Part("spatial", 16_000, is_static=True), Part("place", 4_000, is_static=True)
 SHOWN = Part("spatial", 200), Part("place", 100)
 RELABELLED_EPISODES = 60
 FIRST_RELABELLED_SEED = 400_000
@@ -46,7 +46,7 @@ SHARE_BEFORE = 0.6  # of the minutes, before a policy's own episodes are relabel
 class Data:
     """Recordings to merge, and the environment's flags for recording and evaluating."""
 
-    parts: tuple[Part, ...] = (*STATIC, *SHOWN)
+    parts: tuple[Part, ...] = (*SCENES, *SHOWN)
     env_flags: tuple[str, ...] = ()
 
     def task(self, suite: str) -> Task:
@@ -182,8 +182,10 @@ class Run:
     def _relabelled(self, checkpoint: Path, suite: str) -> Path:
         folder = self._folder / f"relabelled_{suite}"
         if not folder.exists():
-            part = Part(suite, RELABELLED_EPISODES, OWN, first_seed=FIRST_RELABELLED_SEED)
-            run_record(self._data.task(suite), folder, part, "--pointing", f"--policy.path={checkpoint}")
+            part = Part(suite, RELABELLED_EPISODES, first_seed=FIRST_RELABELLED_SEED)
+            run_record(
+                self._data.task(suite), folder, part, "--pointing", "--relabel", f"--policy.path={checkpoint}"
+            )
         return folder
 
     def _trained(self, dataset: Path, folder: Path, steps: int, *flags: str) -> Path:

@@ -154,7 +154,7 @@ def test_parts_of_a_task_are_recorded_and_merged(monkeypatch: pytest.MonkeyPatch
         Path(roots[0]).mkdir()
 
     monkeypatch.setattr(learn, "run_command", run)
-    parts = (learn.Part("goal", 3), learn.Part("spatial", 400, learn.SCENES, (0, 11)))
+    parts = (learn.Part("goal", 3), learn.Part("spatial", 400, is_static=True, task_ids=(0, 11)))
     task = learn.Task((), episodes=1, trainings={}, suite="all", parts=parts)
     (tmp_path / "shown_goal").mkdir()  # by a run that was stopped
     learn.record(task, 3, dataset)
