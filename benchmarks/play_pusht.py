@@ -29,7 +29,7 @@ import numpy as np
 from machine import make_parser, parse_on_idle_machine, positive, write_figures
 from recipes import FOLDER, last_checkpoint, read_recipe, recipe_path
 
-from lerobot_bomb.bootstrap import bootstrap_interval
+from lerobot_bomb.bootstrap import Estimate
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.tables import print_table
 
@@ -203,9 +203,8 @@ def print_contenders(contenders: list[Contender]) -> None:
 
 def over_episodes(values: Sequence[float]) -> str:
     """Format the mean and its bootstrap interval."""
-    interval = bootstrap_interval(np.array(values), np.ones(len(values)))
-    text = "" if interval is None else f" [{interval[0]:.3f}, {interval[1]:.3f}]"
-    return f"{fmean(values):.3f}{text} over {len(values)} episodes"
+    estimate = Estimate.of(np.array(values), np.ones(len(values)))
+    return f"{estimate.text('.3f')} over {len(values)} episodes"
 
 
 if __name__ == "__main__":

@@ -74,10 +74,8 @@ def stand_still(state: PrivilegedState) -> np.ndarray:
 
 def misplace_white(state: PrivilegedState) -> np.ndarray:
     """Put white stones down 2 cm from their places: that fails, and sooner than standing still."""
-    off = {True: np.array([0.02, 0, 0]), False: np.zeros(3)}
-    goals = [
-        replace(each, xyz=each.xyz + off[bool(state.stone_is_white[each.stone])]) for each in state.goals
-    ]
+    off = [np.array([0.02 * is_white, 0, 0]) for is_white in state.stone_is_white]
+    goals = [replace(each, xyz=each.xyz + off[each.stone]) for each in state.goals]
     return expert_action(replace(state, goals=tuple(goals)))
 
 

@@ -27,7 +27,7 @@ def merge_datasets(folders: Sequence[Path], repo_id: str, root: Path) -> tuple[i
     first = metas[0]
     for folder, meta in zip(folders, metas, strict=True):
         names = [name for name in ("fps", "robot_type") if getattr(meta, name) != getattr(first, name)]
-        both = {**first.features, **meta.features}
+        both = first.features | meta.features
         names += [key for key in both if meta.features.get(key) != first.features.get(key)]
         if names:
             raise ValueError(
