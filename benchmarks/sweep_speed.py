@@ -52,7 +52,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             started = time.perf_counter()
             results = run_way(Path(folder))
-            hourly[name] = 3600 * manifest.num_episodes / (time.perf_counter() - started)
+            hourly[name] = 3600 * manifest.num_records / (time.perf_counter() - started)
             records[name] = comparable(read_results(results))
         if name != TOGETHER and records[name] != records[EACH]:  # its batches are of another kind
             raise SystemExit(f"{name} gives other records than {EACH}")

@@ -70,8 +70,10 @@ def flag_errors() -> Iterator[None]:
         raise FlagError(str(error)) from None
 
 
-def refuse_recording_of_several(config: Any) -> None:
-    """Raise a FlagError if LeRobot's EvalPipelineConfig is to record several episodes of an environment."""
+def check_eval_flags(config: Any) -> None:
+    """Raise a FlagError if LeRobot's EvalPipelineConfig runs no episode, or records several."""
+    if config.eval.n_episodes < 1:
+        raise FlagError(f"--eval.n_episodes={config.eval.n_episodes} must be at least 1")
     if config.eval.recording and config.eval.n_episodes > 1:
         raise FlagError(
             f"--eval.recording=true with --eval.n_episodes={config.eval.n_episodes}: LeRobot writes one "

@@ -1,8 +1,13 @@
-"""Checks of flags that are paths or choices; light, as the simulator's processes import it."""
+"""Values of flags, and checks of paths and choices; light, as the simulator's processes import it."""
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+
+
+def flag_value(flags: Sequence[str], name: str) -> str | None:
+    """Return a flag's value: 'bomb' of '--env.type=bomb'; None if it is not given."""
+    return next((flag.partition("=")[2] for flag in flags if flag.startswith(f"{name}=")), None)
 
 
 def check_link(flag: str, path: Path) -> None:

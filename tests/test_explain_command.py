@@ -9,6 +9,7 @@ import pytest
 from explain_cases import end_episodes_after
 
 from lerobot_bomb.bomb.board import HALVES
+from lerobot_bomb.commands.explain import free_folder
 from lerobot_bomb.commands.main import main
 
 MAX_BYTES = 5e6  # of a page
@@ -56,6 +57,14 @@ def test_one_episode(policy_type: str, tmp_path: Path, capsys: pytest.CaptureFix
     assert masked["nothing"] == found["result"] and found["counterfactuals"] == []
     assert len(found["gripper_xy_m"]) == found["result"]["steps"] + 1
     assert found["masked_paths"]["nothing"]["gripper_xy_m"] == found["gripper_xy_m"]
+
+
+def test_the_default_folder_is_one_that_is_free(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for expected in ("explain", "explain-2", "explain-3"):
+        folder = free_folder()
+        assert folder == Path("outputs", expected)
+        folder.mkdir(parents=True)
 
 
 @pytest.mark.long

@@ -53,6 +53,11 @@ def test_a_wrong_flag_in_a_config_file_is_one_line(
         assert capsys.readouterr().err.strip().splitlines()[-1] == f"error: {MESSAGES[command]}"
 
 
+def test_an_evaluation_has_episodes() -> None:
+    with pytest.raises(FlagError, match=r"--eval\.n_episodes=0 must be at least 1"):
+        EvalPipelineConfig(env=make_env_config("bomb"), eval=EvalConfig(n_episodes=0, batch_size=1))
+
+
 @pytest.mark.parametrize("env_type", ["bomb", "bomb_pusht", "bomb_libero"])
 def test_several_episodes_of_an_environment_are_not_recorded_under_one_instruction(
     env_type: str, stock_cli: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]

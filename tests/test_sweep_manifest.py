@@ -18,7 +18,7 @@ from lerobot_bomb.sweep.store import Store
 
 def test_a_plan_is_every_policy_on_every_task_under_every_condition() -> None:
     manifest = plan(("bomb:fdvla", "act"), ("place", "object"), ("none", "light:3"), 5, 20, 8, FLAGS)
-    assert len(manifest.jobs) == 8 and manifest.num_episodes == 160
+    assert len(manifest.jobs) == 8 and manifest.num_records == 160
     first = manifest.jobs[0]
     assert first.flags == [
         "--policy.path=bomb:fdvla", "--policy.device=cpu", "--env.type=bomb", "--env.image_size=32",
@@ -26,6 +26,23 @@ def test_a_plan_is_every_policy_on_every_task_under_every_condition() -> None:
         "--eval.batch_size=5", "--eval.use_async_envs=false",
     ]  # fmt: skip
     assert manifest.jobs[-1].policy[0] == "--policy.type=act"
+
+
+@pytest.mark.parametrize(
+    ("flags", "num_tasks"),
+    [
+        (("--env.type=bomb_libero",), 10),
+        (("--env.type=bomb_libero", "--env.task=libero_90"), 90),
+        (("--env.type=bomb_libero", "--env.task_ids=[3,7]"), 2),
+        (("--env.type=libero", "--env.task=libero_goal"), 10),
+        (("--env.type=bomb", "--env.task=all"), 5),
+        (("--env.type=bomb", "--env.task=goal", "--env.task_ids=[4]"), 1),
+        (("--env.type=bomb_pusht",), 1),
+        (("--env.type=aloha",), 1),
+    ],
+)
+def test_a_job_runs_its_episodes_in_each_of_its_tasks(flags: tuple[str, ...], num_tasks: int) -> None:
+    assert Job(("--policy.type=act",), flags, 0, 20, 1).num_records == 20 * num_tasks
 
 
 def test_jobs_have_names_of_their_own() -> None:

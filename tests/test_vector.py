@@ -1,5 +1,8 @@
+import os
+import signal
 import sys
 from functools import partial
+from multiprocessing import active_children
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +41,19 @@ def test_workers_import_neither_torch_nor_lerobot() -> None:
     envs = LazyVectorEnv([partial(ImportSpy, EpisodeSpec(seed=0), SMALL)] * 2, use_async=True)
     try:
         assert envs.call("heavy_modules") == ([], [])
+    finally:
+        envs.close()
+
+
+def test_ctrl_c_which_a_terminal_sends_to_workers_too_does_not_end_them() -> None:
+    envs = LazyVectorEnv([partial(ImportSpy, EpisodeSpec(seed=0), SMALL)] * 2, use_async=True)
+    try:
+        envs.reset(seed=SEEDS)
+        workers = [worker.pid for worker in active_children() if worker.pid]
+        assert len(workers) == 2
+        for pid in workers:
+            os.kill(pid, signal.SIGINT)
+        assert envs.step(STILL)[1].tolist() == [0, 0]
     finally:
         envs.close()
 

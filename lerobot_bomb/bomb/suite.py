@@ -14,6 +14,7 @@ from lerobot_bomb.bomb.privileged_state import Goal
 from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.bomb.suites import OWN_SUITES, SUITES
 from lerobot_bomb.conditions import ALL
+from lerobot_bomb.flags import one_of
 
 FIRST_VERSION = "1.0"  # of every suite, and of lines and recordings that name none
 NUM_TRAINED_TEMPLATES = 3  # the first ones of a suite; the others are held out
@@ -113,7 +114,12 @@ def task_version(name: str) -> str:
 
 
 def suites_of(name: str) -> tuple[str, ...]:
-    """Return the suites that a flag's value names: one, or `all`."""
+    """Return the suites that a flag's value names: one, or `all`.
+
+    Raises:
+        ValueError: there is no such suite.
+    """
+    one_of("--env.task", name, (*SUITES, ALL))
     return OWN_SUITES if name == ALL else (name,)
 
 

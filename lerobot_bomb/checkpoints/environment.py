@@ -14,7 +14,7 @@ from lerobot_bomb.checkpoints.training import dataset_of, read_train_config
 from lerobot_bomb.compat.hooks.policies import training_data
 from lerobot_bomb.compat.use import use
 from lerobot_bomb.data.facts import DatasetFacts
-from lerobot_bomb.flag_errors import FlagError, refuse_recording_of_several
+from lerobot_bomb.flag_errors import FlagError, check_eval_flags
 
 logger = logging.getLogger(__name__)
 
@@ -114,7 +114,7 @@ def complete_evaluation(config: Any) -> None:
     Raises:
         FlagError: the evaluation would record several episodes.
     """
-    refuse_recording_of_several(config)
+    check_eval_flags(config)
     if hasattr(config.env, "take_image_size"):
         config.env.take_image_size(config.policy)
 

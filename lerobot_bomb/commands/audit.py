@@ -11,6 +11,7 @@ from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE
 from lerobot_bomb.checkpoints.training import dataset_of, read_train_config, trained_image_size
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO, check_at_least, checkpoint_flag, path_flag
 from lerobot_bomb.files import written_whole
+from lerobot_bomb.flags import flag_value
 from lerobot_bomb.report import verdicts
 from lerobot_bomb.report.page import render
 from lerobot_bomb.report.table import Section
@@ -32,7 +33,7 @@ from lerobot_bomb.results.instructions import other_instructions
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.local import run_part
-from lerobot_bomb.sweep.manifest import Job, Manifest, check_flags, flag_value, largest_divisor
+from lerobot_bomb.sweep.manifest import Job, Manifest, check_flags, largest_divisor
 from lerobot_bomb.tables import print_table
 
 if TYPE_CHECKING:

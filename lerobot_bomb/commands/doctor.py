@@ -111,12 +111,14 @@ def check_sapien() -> Iterator[Component]:
     """Check that the second simulator is installed, and that its renderer finds a driver."""
     simulators = importlib.import_module("lerobot_env_bomb.simulators")
     checks = {
-        "--env.simulator=sapien": lambda: simulators.import_with_sapien("sapien_physics") and "can run",
-        "--env.render_preset=sapien": lambda: simulators.import_with_sapien("sapien_render").device_name(),
+        "simulator": lambda: simulators.import_with_sapien("sapien_physics") and "can run",
+        "render_preset": lambda: simulators.import_with_sapien("sapien_render").device_name(),
     }
-    for flag, check in checks.items():
+    own = {"simulator": "mujoco", "render_preset": "fast"}
+    for name, check in checks.items():
+        flag = f"--env.{name}=sapien"
         try:
-            simulators.check_simulator("sapien", "fast")
+            simulators.check_simulator(**(own | {name: "sapien"}))
             yield Component(flag, check())
         except ValueError as error:
             yield Component(flag, str(error), absent=True)
@@ -135,11 +137,13 @@ def check_libero() -> Iterator[Component]:
         yield Component("libero", str(error), absent=True)
         return
     whole = [suite for suite in SUITES if not missing[suite]]
-    found = f"tasks in {folders['bddl_files']}, assets in {libero.assets}"
+    if whole:
+        detail = f"{', '.join(whole)} can run; tasks in {folders['bddl_files']}, assets in {libero.assets}"
+        yield Component("libero", detail)
     if len(whole) < len(SUITES):
+        others = [suite for suite in SUITES if missing[suite]]
         found = describe_missing_assets(libero.assets, sorted(set().union(*missing.values())))
-        found += f"; whole for {', '.join(whole)}" if whole else ""
-    yield Component("libero", found, absent=not whole)
+        yield Component("other suites of libero", f"{', '.join(others)}: {found}", absent=True)
 
 
 def check_types() -> Iterator[Component]:

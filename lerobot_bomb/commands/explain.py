@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,7 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_viewed_arguments(parser)
     add_checkpoint_arguments(parser, "checkpoint to explain (default: the record's)")
-    add("--output", type=path_flag, default=DEFAULT_FOLDER, help=f"new folder (default: {DEFAULT_FOLDER})")
+    numbered = f"{DEFAULT_FOLDER}, {DEFAULT_FOLDER}-2, ..."
+    add("--output", type=path_flag, help=f"new folder (default: the first free one of {numbered})")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -68,10 +70,17 @@ def run(args: argparse.Namespace) -> int:
     check_at_least(args, episodes=1, grid=1)
     if args.episodes > 1 and args.step is not None:
         raise ValueError(f"--step={args.step} is of one episode; drop it or --episodes={args.episodes}")
-    check_new_folder("output", args.output)
+    args.output = args.output or free_folder()
+    check_new_folder("--output", args.output)
     query = _of_flags(args) if args.results is None else _of_record(args)
     _check_images(args, query.viewed(query.seed).env_flags["image_size"])
     return (_explain_one if args.episodes == 1 else _explain_several)(args, query)
+
+
+def free_folder() -> Path:
+    """Return the default folder, or the first free one of those numbered from 2 on."""
+    numbered = (DEFAULT_FOLDER.with_name(f"{DEFAULT_FOLDER.name}-{number}") for number in count(2))
+    return next(folder for folder in chain([DEFAULT_FOLDER], numbered) if not folder.exists())
 
 
 def _check_images(args: argparse.Namespace, image_size: int) -> None:

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
@@ -142,6 +143,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     use()
     try:
         return module_of(name).run(_parse(name, words))
+    except BrokenPipeError:  # of `| head`; what is printed at exit must not raise it again
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except _told() as error:
         print(f"{PROGRAM} {name}: {error}", file=sys.stderr)
         return 1

@@ -7,8 +7,8 @@ from typing import Any
 from lerobot_bomb.commands.arguments import add_file_and_eval_flags, long_forms
 from lerobot_bomb.environments import env_type
 from lerobot_bomb.files import read_json
+from lerobot_bomb.flags import flag_value
 from lerobot_bomb.results.writing import write_record
-from lerobot_bomb.sweep.manifest import flag_value
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -31,7 +31,7 @@ def missing_of_sweep(path: Path, num_records: int) -> str:
     if path.name != RESULTS or not path.with_name(NAME).is_file():
         return ""
     try:
-        number = Manifest.read(path.parent).num_episodes
+        number = Manifest.read(path.parent).num_records
     except ValueError as error:  # the episodes can be read all the same
         return f"{path}: whether episodes are missing cannot be said: {error}"
     errors = path.with_name(ERRORS)

@@ -21,11 +21,11 @@ from lerobot_bomb.commands.cluster_jobs import (
 from lerobot_bomb.commands.next_steps import print_next
 from lerobot_bomb.commands.table import PROGRAM
 from lerobot_bomb.environments import ENVIRONMENTS, env_type
-from lerobot_bomb.flags import one_of
+from lerobot_bomb.flags import flag_value, one_of
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.local import PYTHON, progress, run_part
-from lerobot_bomb.sweep.manifest import NAME, Job, Manifest, flag_value, plan, policy_flag
+from lerobot_bomb.sweep.manifest import NAME, Job, Manifest, plan, policy_flag
 from lerobot_bomb.sweep.store import RESULTS, Store
 from lerobot_bomb.tables import print_lines
 
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--env.task", "--task", "--tasks", dest="tasks", type=parse_conditions, default=(), help=tasks)
     conditions = "none,camera:3,all:1-5; each:1-5 is every axis at every level"
     add_env_flag(parser, "perturbations", type=parse_conditions, default=(), help=conditions)
-    add("--episodes", type=int, default=20, help="of each job (default: 20)")
+    add("--episodes", type=int, default=20, help="of each task and condition (default: 20)")
     add("--seed", type=int, default=TEST_SEEDS[0], help=f"the first one (default: {TEST_SEEDS[0]})")
     add("--batch_size", type=int, default=MAX_BATCH, help=f"at most (default: {MAX_BATCH})")
     add("--workers", type=int, default=1, help="processes, each on a GPU in turn (default: 1)")
@@ -99,8 +99,11 @@ def _run_jobs(args: argparse.Namespace, store: Store, jobs: list[Job]) -> int:
     store.merge()
     print_lines(*store.lines())
     if any(map(store.is_finished, jobs)):
-        path = store.folder / RESULTS
-        print_next({shlex.join([PROGRAM, "results", str(path)]): "rates, changes and failures"})
+        path = str(store.folder / RESULTS)
+        steps = {"results": "rates, changes and failures"}
+        if len({job.policy for job in store.manifest.jobs}) == 2:
+            steps["compare"] = "which policy is better"
+        print_next({shlex.join([PROGRAM, name, path]): purpose for name, purpose in steps.items()})
     is_whole = all(store.is_finished(job) and not store.errors(job) for job in jobs)
     return 0 if is_whole else 1
 

@@ -9,12 +9,11 @@ from lerobot_bomb import __version__
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, EpisodeSpec
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
 from lerobot_bomb.bomb.suite import specs_of_tasks, suites_of, task_version
-from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import ALL, NONE
 from lerobot_bomb.data.base_recording import BaseRecording
 from lerobot_bomb.data.rollout_pool import RolloutSettings
 from lerobot_bomb.envs.rollout import Expert
-from lerobot_bomb.flags import one_of, rewording_errors
+from lerobot_bomb.flags import rewording_errors
 from lerobot_bomb.results.origin import installed_version, sapien_version
 
 if TYPE_CHECKING:
@@ -63,7 +62,7 @@ class Recording(BaseRecording):
         if self.static:
             self._of_scenes()
         self._check(self.perturbations, self.noise)
-        one_of("--env.task", self.task, (*SUITES, ALL))
+        suites_of(self.task)  # raises if there are none
         if self.task_ids and self.task == ALL:
             raise ValueError(
                 f"--env.task_ids={list(self.task_ids)} are numbers in a suite; --env.task={ALL} is of all"

@@ -1,10 +1,12 @@
 """Vector environments whose workers start in under a second and only when they are needed."""
 
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from functools import partial
+from multiprocessing import parent_process
 from typing import Any
 
 import gymnasium as gym
@@ -74,6 +76,13 @@ def _make_frozen(make_one: Callable[[], gym.Env]) -> gym.Env:
     return FreezeAfterEnd(make_one())
 
 
+def _make_in_worker(make_one: Callable[[], gym.Env]) -> gym.Env:
+    """Make an env that Ctrl-C, which reaches every process of a terminal, leaves to its parent to end."""
+    if parent_process() is not None:  # gymnasium makes one in the parent, too, to see its spaces
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return _make_frozen(make_one)
+
+
 class LazyVectorEnv(VectorEnv):
     """A vector env that starts its workers on first use.
 
@@ -128,8 +137,9 @@ class LazyVectorEnv(VectorEnv):
         """Start the envs unless they run; LeRobot calls this by name to prefetch the next condition."""
         if self._envs is None:
             late = self._known_late(self.num_envs)
+            make = _make_in_worker if self._use_async else _make_frozen
             factories = [
-                partial(_make_frozen, partial(make_one, **of_one))
+                partial(make, partial(make_one, **of_one))
                 for make_one, of_one in zip(self._make_ones, late, strict=True)
             ]
             if self._use_async:
@@ -147,7 +157,7 @@ class LazyVectorEnv(VectorEnv):
         envs = self._ensure()
         try:
             yield envs
-        except Exception:
+        except BaseException:  # also Ctrl-C
             if self._use_async:
                 self.close(terminate=True)
             raise

@@ -22,7 +22,7 @@ from lerobot_bomb.bomb.observation import (
 )
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suite import FIRST_VERSION, find_suite
-from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.bomb.suites import OWN_SUITES, SUITES
 from lerobot_bomb.bootstrap import bca_interval, sums_by
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.flags import one_of
@@ -108,6 +108,7 @@ class EpisodeResult(Record):
     drawn: ClassVar = ("target", "color", "task_id")
     comparable: ClassVar = {"simulator": ("SAPIEN",), "render_preset": ("SAPIEN", "OpenGL")}
     tasks: ClassVar = (*SUITES, ALL)
+    suite_sizes: ClassVar = {ALL: len(OWN_SUITES)}
     measures: ClassVar = (
         Measure("moves made", _progress, "mean share of an episode's moves"),
         Measure("placement error", _placement_error, "median of the stones that were put down"),

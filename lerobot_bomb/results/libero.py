@@ -6,7 +6,7 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Protocol, Self
 
 from lerobot_bomb.libero.assets import SUITES
-from lerobot_bomb.libero.episode import LIBERO_PROTOCOL_VERSION, LiberoFailure, LiberoSpec
+from lerobot_bomb.libero.episode import LIBERO_PROTOCOL_VERSION, TASKS_PER_SUITE, LiberoFailure, LiberoSpec
 from lerobot_bomb.libero.perturbations import LiberoCondition
 from lerobot_bomb.results import schema
 from lerobot_bomb.results.origin import describe_versions, installed_versions
@@ -56,6 +56,7 @@ class LiberoResult(Record):
     drawn: ClassVar = ("task_id",)
     start: ClassVar = ("seed", "task_id")  # tasks have scenes of their own
     tasks: ClassVar = SUITES
+    suite_sizes: ClassVar = TASKS_PER_SUITE
 
     spec: LiberoSpec
     instruction: str  # text that the policy read

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Protocol, Self
 from lerobot_bomb import __version__
 from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.conditions import AxisCondition
+from lerobot_bomb.flags import flag_value
 from lerobot_bomb.results.inference import Inference
 from lerobot_bomb.results.measures import Measure
 from lerobot_bomb.results.origin import (
@@ -79,6 +80,8 @@ class Record(ABC):
     # fields of a spec that are equal in episodes that start alike, which are not independent
     start: ClassVar[tuple[str, ...]] = ("seed",)
     tasks: ClassVar[Sequence[str]]  # values of --env.task
+    # {value of --env.task that stands for several tasks: their number}
+    suite_sizes: ClassVar[Mapping[str, int]] = {}
     measures: ClassVar[Sequence[Measure]] = ()
     has_results_path: ClassVar[bool] = True  # lerobot-eval writes the records, with --env.results_path
     # an episode's number in its evaluation, not its seed, chooses how it starts: in batches of one
@@ -186,6 +189,14 @@ class Record(ABC):
     @abstractmethod
     def eval_flags(cls, records: Sequence[Self]) -> list[str]:
         """Return lerobot-eval's flags for the environment and tasks of episodes."""
+
+    @classmethod
+    def num_tasks(cls, flags: Sequence[str]) -> int:
+        """Return how many tasks lerobot-eval runs with these flags; 1 if they do not tell."""
+        if (task_ids := flag_value(flags, "--env.task_ids")) is not None:
+            return task_ids.count(",") + 1
+        task = flag_value(flags, "--env.task") or next(iter(cls.tasks), "")
+        return cls.suite_sizes.get(task, 1)
 
     @classmethod
     def env_flags(cls, values: Mapping[str, Any]) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Self
 
 from lerobot_bomb.conditions import NONE, AxisCondition, PerturbedSpec
 from lerobot_bomb.libero.assets import SUITES
+from lerobot_bomb.libero.episode import TASKS_PER_SUITE
 from lerobot_bomb.pusht.episode import IMAGE_SIZE
 from lerobot_bomb.results import pusht, schema
 from lerobot_bomb.results.libero import SIMULATOR, describe_numbered_tasks, task_flags
@@ -77,8 +78,13 @@ class StockResult(Record):
 
 
 @cache
-def stock_result(env_type: str, **facts: Any) -> type[StockResult]:
-    """Return the type of the records of an env type; `facts` are its class variables."""
+def stock_result(env_type: str) -> type[StockResult]:
+    """Return the type of the records of an env type of which only its name is known."""
+    return _stock_result(env_type)
+
+
+def _stock_result(env_type: str, **facts: Any) -> type[StockResult]:
+    """Make the type of the records of an env type; `facts` are its class variables."""
     version = f"lerobot-{env_type}-1.0"
     packages = (f"gym-{env_type}", env_type, "gymnasium", "mujoco")
     known = {"env_type": env_type, "versions": {version: ()}}
@@ -93,8 +99,10 @@ def stock_result(env_type: str, **facts: Any) -> type[StockResult]:
     )
 
 
-StockPushTResult = stock_result(
+StockPushTResult = _stock_result(
     "pusht", tasks=("PushT-v0",), simulator=pusht.SIMULATOR, drawn_size=f"{IMAGE_SIZE}x{IMAGE_SIZE}"
 )
-StockLiberoResult = stock_result("libero", tasks=SUITES, simulator=SIMULATOR, starts_by_number=True)
-StockLiberoPlusResult = stock_result("libero_plus", simulator=SIMULATOR, starts_by_number=True)
+StockLiberoResult = _stock_result(
+    "libero", tasks=SUITES, suite_sizes=TASKS_PER_SUITE, simulator=SIMULATOR, starts_by_number=True
+)
+StockLiberoPlusResult = _stock_result("libero_plus", simulator=SIMULATOR, starts_by_number=True)

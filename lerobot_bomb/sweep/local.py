@@ -26,7 +26,7 @@ def progress(store: Store, jobs: Sequence[Job]) -> Iterator[bool]:
 
     Records of finished jobs are merged at once, whatever ends this process later.
     """
-    total = sum(job.num_episodes for job in jobs)
+    total = sum(job.num_records for job in jobs)
     left, num_before = _not_over(store, jobs)  # what is over is not read again
     has_progressed, num_unmerged = False, len(jobs)
     with tqdm(total=total, initial=num_before + store.num_run(left), unit=" episodes") as bar:

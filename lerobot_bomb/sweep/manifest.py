@@ -12,7 +12,9 @@ from typing import Any
 
 from lerobot_bomb.checkpoints.names import CONFIG, is_hub_id
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
+from lerobot_bomb.environments import env_type
 from lerobot_bomb.files import read_json, written_whole
+from lerobot_bomb.flags import flag_value
 
 VERSION = 1
 NAME = "manifest.json"
@@ -27,7 +29,7 @@ class Job:
     policy: tuple[str, ...]  # flags of lerobot-eval
     env: tuple[str, ...]  # the same
     seed: int  # the first one
-    num_episodes: int
+    num_episodes: int  # of each of its tasks
     batch_size: int
 
     @property
@@ -60,6 +62,11 @@ class Job:
         """Type of the environment, as LeRobot names it; '' where the flags name none."""
         return flag_value(self.env, "--env.type") or ""
 
+    @property
+    def num_records(self) -> int:
+        """Episodes of all its tasks together, as far as the flags tell how many tasks there are."""
+        return self.num_episodes * env_type(self.env_type).record.num_tasks(self.env)
+
     def episode(self, number: int) -> "Job":
         """Return the job of one of its episodes."""
         return Job(self.policy, self.env, self.seed + number, 1, 1)
@@ -76,8 +83,8 @@ class Manifest:
             raise ValueError("a job is there twice")
 
     @property
-    def num_episodes(self) -> int:
-        return sum(job.num_episodes for job in self.jobs)
+    def num_records(self) -> int:
+        return sum(job.num_records for job in self.jobs)
 
     def part(self, text: str) -> list[Job]:
         """Return every n-th job: for '0/4' the first, the fifth, ...
@@ -143,11 +150,6 @@ def parse_part(text: str) -> tuple[int, int]:
     if not (first.isdecimal() and number.isdecimal() and int(first) < int(number)):
         raise ValueError(f"{text} must be PART/PARTS, the parts counted from 0: 0/4 to 3/4")
     return int(first), int(number)
-
-
-def flag_value(flags: Sequence[str], name: str) -> str | None:
-    """Return a flag's value: 'bomb' of '--env.type=bomb'; None if it is not given."""
-    return next((flag.partition("=")[2] for flag in flags if flag.startswith(f"{name}=")), None)
 
 
 def check_flags(flags: Sequence[str]) -> None:

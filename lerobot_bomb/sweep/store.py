@@ -208,9 +208,9 @@ class Store:
         jobs = self.manifest.jobs
         finished = [job for job in jobs if self.is_finished(job)]
         errors = [error for job in finished for error in self.errors(job)]
-        episodes = sum(job.num_episodes for job in finished) - len(errors)
+        episodes = self.num_run(finished) - len(errors)
         text = [
-            f"{self.folder / RESULTS}: {episodes} of {self.manifest.num_episodes} episodes, "
+            f"{self.folder / RESULTS}: {episodes} of {self.manifest.num_records} episodes, "
             f"{len(finished)} of {len(jobs)} jobs"
         ]
         if errors:

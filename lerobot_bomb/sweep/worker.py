@@ -21,8 +21,9 @@ from lerobot_bomb.compat.own.evaluation import KeptPolicy
 from lerobot_bomb.environments import env_type
 from lerobot_bomb.evaluation.eval_info import EVAL_INFO, results_of
 from lerobot_bomb.files import read_json
+from lerobot_bomb.flags import flag_value
 from lerobot_bomb.sweep.check import check
-from lerobot_bomb.sweep.manifest import Job, Manifest, flag_value
+from lerobot_bomb.sweep.manifest import Job, Manifest
 from lerobot_bomb.sweep.store import POLL_S, REFUSED, EpisodeError, Store, missing_seeds
 
 

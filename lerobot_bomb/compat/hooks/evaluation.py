@@ -68,7 +68,14 @@ def tell_of_evaluations() -> None:
             given = signature(usual).bind(*args, **options).arguments
             if begin_evaluation := getattr(given["env"], BEGIN, None):
                 begin_evaluation(given["n_episodes"], given.get("start_seed"))
-            return usual(*args, **options)
+            try:
+                return usual(*args, **options)
+            except KeyboardInterrupt:
+                if path := getattr(given["env"], "results_path", None):
+                    logging.info(
+                        "%s has the episodes that ended; to be able to resume: lerobot-bomb sweep", path
+                    )
+                raise
 
         return eval_policy
 
