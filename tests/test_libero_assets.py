@@ -12,7 +12,7 @@ import yaml
 from lerobot_bomb.commands import doctor
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.libero import assets
-from lerobot_bomb.libero.assets import Libero, prepare_libero
+from lerobot_bomb.libero.assets import SUITES, Libero, prepare_libero
 
 SUITE = "libero_spatial"
 TASK = """(define (problem LIBERO_Tabletop_Manipulation)
@@ -185,31 +185,34 @@ def test_a_missing_installation_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
         prepare_libero()
 
 
-def libero_line(capsys: pytest.CaptureFixture[str], patch: pytest.MonkeyPatch) -> str:
+def libero_lines(capsys: pytest.CaptureFixture[str], patch: pytest.MonkeyPatch) -> list[str]:
     """Return what `lerobot-bomb doctor` says of LIBERO."""
     patch.setattr(doctor, "CHECKS", (doctor.check_libero,))
     assert main(["doctor"]) == 0  # all else works without it
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if "libero:" in line]
-    return line.strip()
+    _, *lines, summary = capsys.readouterr().out.splitlines()
+    assert summary.startswith("everything works")
+    return [line.strip() for line in lines]
 
 
 def test_the_doctor_says_whether_libero_can_run(
     libero: Libero, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert libero_line(capsys, monkeypatch) == (
+    assert libero_lines(capsys, monkeypatch) == [
         f"absent  libero: LIBERO has no {libero.config_file}, and asks on the standard input when it is "
         "imported; to have it written: echo n | python -c 'import libero.libero'"
-    )
+    ]
     assert not libero.config_file.exists()
     libero.write_config()
-    found = f"ok  libero: tasks in {libero.package / 'bddl_files'}, assets in {libero.assets}"
-    assert libero_line(capsys, monkeypatch) == found
+    where = f"tasks in {libero.package / 'bddl_files'}, assets in {libero.assets}"
+    assert libero_lines(capsys, monkeypatch) == [f"ok  libero: {', '.join(SUITES)} can run; {where}"]
     (libero.assets / "textures").rmdir()
     (libero.assets / "turbosquid_objects").rmdir()
-    line = libero_line(capsys, monkeypatch)
+    (line,) = libero_lines(capsys, monkeypatch)
+    assert line.startswith("absent  libero: libero_spatial, ")
     assert "2 missing (textures, turbosquid_objects); hf download lerobot/libero-assets" in line
     monkeypatch.setattr(Libero, "find", lambda: None)
-    assert libero_line(capsys, monkeypatch).startswith("absent  libero: not installed")
+    (line,) = libero_lines(capsys, monkeypatch)
+    assert line.startswith("absent  libero: not installed")
 
 
 @pytest.fixture
@@ -260,7 +263,11 @@ def test_the_doctor_names_the_suites_that_can_run(
     with_assets: Libero, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with_assets.write_config()
-    assert libero_line(capsys, monkeypatch).endswith("; whole for libero_spatial")
+    can_run, cannot = libero_lines(capsys, monkeypatch)
+    assert can_run.startswith("ok  libero: libero_spatial can run; tasks in ")
+    assert cannot.startswith(
+        "absent  other suites of libero: libero_object, libero_goal, libero_10, libero_90: "
+    )
 
 
 def test_every_scene_of_the_real_one_is_known(with_assets: Libero) -> None:

@@ -143,7 +143,8 @@ def check_libero() -> Iterator[Component]:
     if len(whole) < len(SUITES):
         others = [suite for suite in SUITES if missing[suite]]
         found = describe_missing_assets(libero.assets, sorted(set().union(*missing.values())))
-        yield Component("other suites of libero", f"{', '.join(others)}: {found}", absent=True)
+        name = "other suites of libero" if whole else "libero"
+        yield Component(name, f"{', '.join(others)}: {found}", absent=True)
 
 
 def check_types() -> Iterator[Component]:
