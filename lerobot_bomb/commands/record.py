@@ -52,7 +52,7 @@ from lerobot_bomb.flags import rewording_errors
 from lerobot_bomb.sweep.local import PYTHON
 
 JOBS, SCRIPT = "jobs", "record.sbatch"  # the folder ROOT.jobs, and a file in it
-NOT_OF_JOBS = ("command", "root", "resume", "shard", "join", "slurm", *SUBMITIT_FLAGS)
+NOT_OF_JOBS = ("command", "default_of", "root", "resume", "shard", "join", "slurm", *SUBMITIT_FLAGS)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -137,12 +137,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _recording(args: argparse.Namespace) -> BaseRecording:
-    if args.env_type == BOMB_LIBERO:
-        parser = argparse.ArgumentParser()
-        add_arguments(parser)
-        recording = libero_recording(args, parser.get_default)
-    else:
-        recording = _bomb_recording(args)
+    recording = libero_recording(args) if args.env_type == BOMB_LIBERO else _bomb_recording(args)
     if not 1 <= args.workers <= recording.episodes:
         raise ValueError(
             f"--workers={args.workers} must lie in 1..{recording.episodes} (--episodes or --static)"

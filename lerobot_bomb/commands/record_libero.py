@@ -1,9 +1,7 @@
 """Flags of ``lerobot-bomb record --env.type=bomb_libero``."""
 
 import argparse
-from collections.abc import Callable
 from dataclasses import fields
-from typing import Any
 
 from lerobot_bomb.data.libero_recording import LiberoRecording
 from lerobot_bomb.libero.goals import check_goals
@@ -36,20 +34,21 @@ def add_env_type_arguments(parser: argparse.ArgumentParser) -> None:
         default = getattr(LiberoRecording, name)
         help = f"of bomb_libero's images, in pixels (default: {default})"
         parser.add_argument(f"--env.{name}", dest=name, type=int, help=help)
+    parser.set_defaults(default_of=parser.get_default)  # tells which arguments were given
 
 
-def libero_recording(args: argparse.Namespace, default_of: Callable[[str], Any]) -> LiberoRecording:
+def libero_recording(args: argparse.Namespace) -> LiberoRecording:
     """Return the recording that flags ask for.
 
     Raises:
         ValueError: a flag is not of bomb_libero or wrong, or LIBERO or its assets are missing.
     """
     for name in BOMB_ONLY:
-        if getattr(args, name) != default_of(name):
+        if getattr(args, name) != args.default_of(name):
             flag = FLAG_OF.get(name, name)
             raise ValueError(f"--{flag} is of --env.type={BOMB}; leave it out with --env.type={BOMB_LIBERO}")
     given = {name: value for name, value in vars(args).items() if name in RECORDING_FLAGS}
-    left_out = {name for name in (*SIZES, "task") if given[name] == default_of(name)}
+    left_out = {name for name in (*SIZES, "task") if given[name] == args.default_of(name)}
     recording = LiberoRecording(**{name: value for name, value in given.items() if name not in left_out})
     check_goals(recording.conditions)
     return recording
