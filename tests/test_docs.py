@@ -14,9 +14,13 @@ import draccus
 import pytest
 import yaml
 
+from lerobot_bomb.bomb.episode import Failure
 from lerobot_bomb.checkpoints.names import PREPROCESSOR
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.table import COMMANDS
+from lerobot_bomb.failures import FailureClass
+from lerobot_bomb.libero.episode import LiberoFailure
+from lerobot_bomb.pusht.episode import PushTFailure
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -45,6 +49,17 @@ def test_the_sites_navigation_is_the_map_of_the_documentation() -> None:
         for text in texts
     }
     assert list(sections.items()) == list(mapped.items())
+
+
+@pytest.mark.parametrize(
+    ("name", "classes"),
+    [("bomb.md", Failure), ("pusht.md", PushTFailure), ("libero.md", LiberoFailure)],
+)
+def test_a_page_says_of_each_failure_class_what_the_report_says(
+    name: str, classes: type[FailureClass]
+) -> None:
+    rows = re.findall(r"^\| `(\w+)` \| ([^|]+) \|$", (ROOT / "docs" / name).read_text(), re.M)
+    assert {each.value: each.meaning for each in classes}.items() <= dict(rows).items()
 
 
 def commands(page: Path) -> list[list[str]]:

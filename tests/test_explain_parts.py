@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from explain_cases import NAMES, SPEC, loaded, moment
+from matplotlib.figure import Figure
 
 from lerobot_bomb.bomb.board import BOARD, HALVES
 from lerobot_bomb.explain.aggregate import mean_of, means_of
@@ -20,6 +21,7 @@ from lerobot_bomb.explain.maps import tinted
 from lerobot_bomb.explain.moment import Explanation
 from lerobot_bomb.explain.probes import probe_classes, probe_values
 from lerobot_bomb.explain.spans import difference, named_spans, span_of, spans_of_words, token_offsets
+from lerobot_bomb.report import explained_film
 from lerobot_bomb.report.explained_film import paths_chart
 
 pytestmark = pytest.mark.usefixtures("loaded_policies")
@@ -201,6 +203,16 @@ def test_every_path_has_a_look_of_its_own_and_the_numbers_are_in_a_table() -> No
     assert len(looks) > 20 and all(name in chart.svg for name in runs)
     (table,) = chart.tables
     assert [cell.value or cell.text for cell in table.rows[1]] == ["mask 1", "failed, dropped", "2", 20, 20]
+
+
+def test_a_stone_that_ended_far_off_the_board_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    figure = Figure()
+    monkeypatch.setattr(explained_film, "draw", lambda title, size, paint: paint(figure) or "")
+    ended = cast("Any", SimpleNamespace(is_success=False, failure="dropped"))
+    stone_xy = np.array([0.4, -0.5])
+    paths_chart("Paths", {"it": EpisodeRun(ended, np.zeros((3, 3)), stone_xy[None], None)}, None)
+    (low_x, high_x), (low_y, high_y) = figure.axes[0].get_xlim(), figure.axes[0].get_ylim()
+    assert low_x < stone_xy[0] < high_x and low_y < stone_xy[1] < high_y
 
 
 def test_conditions_without_an_axis_keep_the_levels_that_were_drawn() -> None:

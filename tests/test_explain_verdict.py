@@ -114,7 +114,7 @@ def test_words_of_a_suite_without_rows_are_named() -> None:
 def test_how_far_it_follows_another_target_is_told() -> None:
     following = {"row": {"along_mm": 31.68}, "column": {"along_mm": 0.4}, "color": {"along_mm": None}}
     assert reasons([moment("carry", following=following)])[-1] == (
-        "Told to go elsewhere, the next action turns there: 31.7 mm at carry for another row."
+        "Told of another place, the next action moves towards it: 31.7 mm at carry for another row."
     )
 
 
@@ -298,6 +298,14 @@ def test_what_a_success_needs_is_not_called_unlooked_at() -> None:
     looks = [moment("grasp", mm=seen(stone=12.0, board=0.1, background=0.0))]
     told = verdict([{"result": result(), "moments": looks, "masked_episodes": masked}])
     assert "It fails if any one of these is hidden in every step: the board." in told
+    assert any("it never looked at the background: hiding it" in sentence for sentence in told)
+
+
+def test_a_board_of_which_one_half_is_needed_is_not_called_unlooked_at() -> None:
+    masked = {"nothing": result(), "object: board's left half": result("imprecise")}
+    halves = {"board's left half": 0.0, "board's right half": 0.0}
+    looks = [moment("grasp", mm=seen(stone=12.0, board=0.1, background=0.0, **halves))]
+    told = verdict([{"result": result(), "moments": looks, "masked_episodes": masked}])
     assert any("it never looked at the background: hiding it" in sentence for sentence in told)
 
 

@@ -29,8 +29,8 @@ STOCK = "stock.py"  # an environment of LeRobot's, which ours is
 CORE = "lerobot_bomb"
 # a folder or module of the core imports from those above it in this list
 ORDER = [
-    "__init__", "registry", "compat", "finite", "flag_errors", "flags", "conditions", "environments",
-    "stats", "bootstrap", "smoothness", "tables", "files", "cuda_graphs",
+    "__init__", "registry", "compat", "finite", "flag_errors", "flags", "conditions", "failures",
+    "environments", "stats", "bootstrap", "smoothness", "tables", "files", "cuda_graphs",
     "bomb", "pusht", "libero", "results", "envs", "actions", "flow", "vlm", "decoding", "training", "data",
     "checkpoints", "evaluation", "viewing", "explain", "report", "hub", "policies", "serving", "harness",
     "sweep", "commands",

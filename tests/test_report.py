@@ -80,6 +80,12 @@ def test_rates_and_costs_are_those_of_the_lines(rows: Rows, written: Path) -> No
     assert sum(int(line["successes"]) for line in lines) == sum(row["is_success"] for row in rows)
 
 
+def test_the_classes_that_occur_are_explained(written: Path) -> None:
+    page = (written / "r.html").read_text()
+    assert "wrong_intersection: put down nearest to another intersection." in page
+    assert "never_reached: " not in page
+
+
 def test_failures_levels_and_the_board_are_those_of_the_lines(rows: Rows, written: Path) -> None:
     bars, *by_condition = tables(written, "Why episodes failed")
     for bar, *cells in bars["rows"]:

@@ -8,6 +8,7 @@ from lerobot_bomb.bomb.board import BOARD, COLORS
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import NONE, PerturbedSpec
+from lerobot_bomb.failures import FailureClass
 from lerobot_bomb.flags import one_of
 
 # Version of the measurement of a policy and of the records. 1.1 is 1.0 with records that name simulator,
@@ -23,6 +24,9 @@ DEFAULT_FPS = 10  # control steps per second
 PHYSICS_HZ = 200  # physics steps per second; a multiple of the control rate
 MAX_SEED = 2**32 - 1  # the largest seed that NumPy accepts from LeRobot
 TEST_SEEDS = range(1000, 1200)  # of evaluations: from LeRobot's default on, as many as the protocol asks for
+DROP_HEIGHT_M = 0.030  # a stone let go higher than this above its resting height was dropped, not placed
+OFF_BOARD_M = 0.75 * BOARD.pitch_m  # from the nearest intersection
+COLLATERAL_TOLERANCE_MM = 10.0  # another stone that is moved farther was disturbed
 
 
 class Stage(StrEnum):
@@ -35,18 +39,28 @@ class Stage(StrEnum):
     PLACED = "placed"
 
 
-class Failure(StrEnum):
+class Failure(FailureClass):
     """Reason why an episode failed; exactly one per failed episode."""
 
-    NEVER_REACHED = "never_reached"
-    MISSED_GRASP = "missed_grasp"
-    DROPPED = "dropped"
-    WRONG_STONE = "wrong_stone"
-    WRONG_INTERSECTION = "wrong_intersection"
-    IMPRECISE = "imprecise"
-    DISTURBED_OTHERS = "disturbed_others"
-    TIMEOUT_HOLDING = "timeout_holding"
-    LIFTED = "lifted"
+    NEVER_REACHED = "never_reached", "the gripper never around the stone"
+    MISSED_GRASP = "missed_grasp", "the stone never lifted"
+    DROPPED = (
+        "dropped",
+        f"let go more than {1e3 * DROP_HEIGHT_M:g} mm above its resting height, or at rest more than "
+        f"{1e3 * OFF_BOARD_M:g} mm from every intersection; or let go elsewhere as time ran out",
+    )
+    WRONG_STONE = "wrong_stone", "another stone carried"
+    WRONG_INTERSECTION = "wrong_intersection", "put down nearest to another intersection"
+    IMPRECISE = "imprecise", "nearest to the target, but outside the tolerance or not flat"
+    DISTURBED_OTHERS = (
+        "disturbed_others",
+        f"well placed, but another stone moved by more than {COLLATERAL_TOLERANCE_MM:g} mm",
+    )
+    TIMEOUT_HOLDING = (
+        "timeout_holding",
+        "time out with the stone between or at the pads, or on the target but not yet at rest",
+    )
+    LIFTED = "lifted", "a stone lifted instead of pushed"
 
 
 def check_seed(seed: int) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, NUM_STONES
-from lerobot_bomb.bomb.episode import Failure, Stage
+from lerobot_bomb.bomb.episode import COLLATERAL_TOLERANCE_MM, DROP_HEIGHT_M, OFF_BOARD_M, Failure, Stage
 from lerobot_bomb.bomb.layout import SceneState
 from lerobot_bomb.bomb.move import TRAY, Move, Place, Plan, distance_m
 from lerobot_bomb.bomb.suite import Episode
@@ -15,9 +15,6 @@ REST_S = 0.5  # a stone that was carried and then rests this long has been put d
 REST_SPEED_M_S = 0.005  # below it a stone rests
 LIFT_M = 0.010  # above its resting height a held stone counts as lifted
 FLAT_TOLERANCE_M = 0.003  # of the height at rest; a stone that leans or lies on another one is higher
-DROP_HEIGHT_M = 0.030  # a stone let go higher than this above the board was dropped, not placed
-OFF_BOARD_M = 0.75 * BOARD.pitch_m  # from the nearest intersection
-COLLATERAL_TOLERANCE_MM = 10.0
 V0_TOLERANCE_MM = 26.0  # of the original benchmark's rule
 
 

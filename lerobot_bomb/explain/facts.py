@@ -6,8 +6,7 @@ They read the values of `explanation.json`.
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from lerobot_bomb.bomb.episode import Failure
-from lerobot_bomb.bomb.judge import COLLATERAL_TOLERANCE_MM
+from lerobot_bomb.bomb.episode import COLLATERAL_TOLERANCE_MM, Failure
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.explain.effects import Values
 from lerobot_bomb.explain.limits import MAX_NAMES

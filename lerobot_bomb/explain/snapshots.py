@@ -90,9 +90,9 @@ def _snapshot(moment: Moment, env: gymnasium.Env) -> Snapshot:
 
 
 def middle_of_phases(moments: list[Snapshot]) -> list[Snapshot]:
-    """Return the middle moment of each phase; of an episode without phases, the middle one."""
+    """Return the middle moment of each phase in time; of an episode without phases, the middle one."""
     by_phase = [[each for each in moments if each.phase == phase] for phase in (*PHASES, "")]
-    return [each[len(each) // 2] for each in by_phase if each]
+    return sorted((each[len(each) // 2] for each in by_phase if each), key=lambda each: each.step)
 
 
 def at_step(moments: list[Snapshot], step: int) -> Snapshot:

@@ -77,6 +77,11 @@ def _distinct(objects: Sequence[Effect]) -> list[Effect]:
     return [each for each in objects if each is shown or each.name not in (BOARD_ITSELF, *HALVES)]
 
 
+def _parts(name: str) -> tuple[str, ...]:
+    """Return the objects that are hidden with one: the board's halves with the board."""
+    return (name, *HALVES) if name == BOARD_ITSELF else (name,)
+
+
 def _changed(effect: Effect) -> str:
     """Return what changes, such as "changes the next action by at most 0.3 mm"."""
     if effect.unit == "mm":
@@ -96,7 +101,9 @@ def _objects(effects: Sequence[Effect], steps: str, felt: Sequence[str]) -> Iter
         [
             each
             for each in effects
-            if not each.matters and not each.is_open and mask_name(OBJECT, each.name) not in felt
+            if not each.matters
+            and not each.is_open
+            and not any(mask_name(OBJECT, name) in felt for name in _parts(each.name))
         ],
         key=lambda each: each.name != STONE,
     )
@@ -189,7 +196,7 @@ def _followed(moments: Sequence[Values]) -> Iterator[str]:
                 found[word] = Effect(WORDS, f"another {word}", phase, mean, "mm", True)
     if found:
         told = _listed([f"{each.evidence} for {each.name}" for each in found.values()])
-        yield f"Told to go elsewhere, the next action turns there: {told}."
+        yield f"Told of another place, the next action moves towards it: {told}."
 
 
 def _pointing(moments: Sequence[Values]) -> Iterator[str]:

@@ -1,10 +1,10 @@
 """An episode of LIBERO: its spec, and its failure class."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 from lerobot_bomb.bomb.episode import check_seed
 from lerobot_bomb.conditions import NONE, PerturbedSpec
+from lerobot_bomb.failures import FailureClass
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.libero.perturbations import LiberoCondition
@@ -19,16 +19,16 @@ ACTION_DIM = 7
 MOTION_DIMS = 6  # change of x, y, z and of orientation; the last is the gripper
 
 
-class LiberoFailure(StrEnum):
+class LiberoFailure(FailureClass):
     """Reason why an episode failed; exactly one per failed episode, the first that holds."""
 
-    NEVER_TOUCHED = "never_touched"  # the gripper met no object
-    WRONG_OBJECT = "wrong_object"  # it met objects, none of those that the task is about
-    UNFINISHED = "unfinished"
-    # of the scripted expert, whatever the gripper met
-    NO_GRASP = "no_grasp"  # none is free
-    NO_PLACE = "no_place"  # none that the goal accepts, and to which a grasp leads
-    NO_PATH = "no_path"  # of the gripper, between two of its poses
+    NEVER_TOUCHED = "never_touched", "the gripper touched no object or fixture"
+    WRONG_OBJECT = "wrong_object", "the gripper touched some, but none of the task's"
+    UNFINISHED = "unfinished", "anything else"
+    # of the scripted expert, whatever the gripper touched
+    NO_GRASP = "no_grasp", "the expert's planner found no free grasp"
+    NO_PLACE = "no_place", "it found no free place that the goal accepts and a grasp leads to"
+    NO_PATH = "no_path", "it found no free path of the gripper"
 
 
 @dataclass(frozen=True)

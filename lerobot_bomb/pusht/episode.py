@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from importlib.util import find_spec
-from math import pi
+from math import degrees, pi
 
 import numpy as np
 
 from lerobot_bomb.bomb.episode import check_seed
 from lerobot_bomb.conditions import NONE, PerturbedSpec, nuisances_of
+from lerobot_bomb.failures import FailureClass
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES, PushTCondition
 
@@ -32,14 +32,18 @@ TURNED_RAD = pi / 9
 AWAY_PX = 10.0  # further than at the start
 
 
-class PushTFailure(StrEnum):
+class PushTFailure(FailureClass):
     """Reason why an episode failed, by how it ended; exactly one per failed episode, the first that holds."""
 
-    NEVER_TOUCHED = "never_touched"
-    ALMOST = "almost"  # at least ALMOST_COVERAGE is covered
-    TURNED_WRONG = "turned_wrong"  # the block is where it should be, but not as it should lie
-    PUSHED_AWAY = "pushed_away"  # it is further from the target than it was
-    TIMEOUT = "timeout"
+    NEVER_TOUCHED = "never_touched", "the agent never touched the block"
+    ALMOST = "almost", f"at least {ALMOST_COVERAGE:g} of the target is covered"
+    TURNED_WRONG = (
+        "turned_wrong",
+        f"the block is within {NEAR_PX:g} pixels of the target, but turned by more than "
+        f"{degrees(TURNED_RAD):.0f} degrees",
+    )
+    PUSHED_AWAY = "pushed_away", f"the block is more than {AWAY_PX:g} pixels further away than at the start"
+    TIMEOUT = "timeout", "anything else"
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,7 @@ def paths_chart(title: str, runs: Mapping[str, EpisodeRun], target_xy: Sequence[
         _paint_board(axes, target_xy)
         for number, (name, run) in enumerate(runs.items()):
             _paint_path(axes, number, name, run)
+        _show_all(axes, [run.stone_xyz[-1, :2] for run in runs.values()])
         figure.legend(loc="outside lower left")  # beside the board, it would be off a phone's screen
 
     rows = [
@@ -81,10 +82,16 @@ def _paint_board(axes: "Axes", target_xy: Sequence[float] | None) -> None:
     if target_xy is not None:
         style = {"markersize": 14, "markeredgewidth": 2, "markeredgecolor": COLORS[1]}
         axes.plot(*target_xy, marker="o", fillstyle="none", linestyle="none", label="target", **style)
-    axes.set_xlim(WORKSPACE_LOW_M[0] - 0.02, WORKSPACE_HIGH_M[0] + 0.01)
-    axes.set_ylim(WORKSPACE_LOW_M[1] - 0.01, WORKSPACE_HIGH_M[1] + 0.01)
     axes.set_aspect("equal")
     axes.set_axis_off()
+
+
+def _show_all(axes: "Axes", stones_xy: Sequence[np.ndarray]) -> None:
+    """Show the workspace, and stones that ended outside of it."""
+    lowest = np.min([*stones_xy, np.array(WORKSPACE_LOW_M[:2]) - (0.01, 0)], axis=0) - 0.01
+    highest = np.max([*stones_xy, np.array(WORKSPACE_HIGH_M[:2])], axis=0) + 0.01
+    axes.set_xlim(lowest[0], highest[0])
+    axes.set_ylim(lowest[1], highest[1])
 
 
 def _paint_path(axes: "Axes", number: int, name: str, run: EpisodeRun) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, COLORS, task_id
 from lerobot_bomb.bomb.environment import Environment, numbered_tasks
-from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec, Failure, Stage
-from lerobot_bomb.bomb.judge import COLLATERAL_TOLERANCE_MM, V0_TOLERANCE_MM
+from lerobot_bomb.bomb.episode import COLLATERAL_TOLERANCE_MM, PROTOCOL_VERSION, EpisodeSpec, Failure, Stage
+from lerobot_bomb.bomb.judge import V0_TOLERANCE_MM
 from lerobot_bomb.bomb.observation import (
     CAMERAS,
     DEFAULT_IMAGE_SIZE,
@@ -108,6 +108,7 @@ class EpisodeResult(Record):
     drawn: ClassVar = ("target", "color", "task_id")
     comparable: ClassVar = {"simulator": ("SAPIEN",), "render_preset": ("SAPIEN", "OpenGL")}
     tasks: ClassVar = (*SUITES, ALL)
+    failures: ClassVar = Failure
     suite_sizes: ClassVar = {ALL: len(OWN_SUITES)}
     measures: ClassVar = (
         Measure("moves made", _progress, "mean share of an episode's moves"),

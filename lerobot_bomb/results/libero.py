@@ -56,6 +56,7 @@ class LiberoResult(Record):
     drawn: ClassVar = ("task_id",)
     start: ClassVar = ("seed", "task_id")  # tasks have scenes of their own
     tasks: ClassVar = SUITES
+    failures: ClassVar = LiberoFailure
     suite_sizes: ClassVar = TASKS_PER_SUITE
 
     spec: LiberoSpec

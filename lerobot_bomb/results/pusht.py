@@ -40,6 +40,7 @@ class PushTResult(Record):
     condition: ClassVar = PushTCondition
     versions: ClassVar = {PUSHT_PROTOCOL_VERSION: ()}
     tasks: ClassVar = ("pusht",)
+    failures: ClassVar = PushTFailure
     measures: ClassVar = (
         mean_measure("max_coverage", "max coverage", "mean, 95 % bootstrap interval over episodes"),
         mean_measure("coverage", "final coverage"),

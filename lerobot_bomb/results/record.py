@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Protocol, Self
 from lerobot_bomb import __version__
 from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.conditions import AxisCondition
+from lerobot_bomb.failures import FailureClass
 from lerobot_bomb.flags import flag_value
 from lerobot_bomb.results.inference import Inference
 from lerobot_bomb.results.measures import Measure
@@ -82,6 +83,7 @@ class Record(ABC):
     tasks: ClassVar[Sequence[str]]  # values of --env.task
     # {value of --env.task that stands for several tasks: their number}
     suite_sizes: ClassVar[Mapping[str, int]] = {}
+    failures: ClassVar[Iterable[FailureClass]] = ()
     measures: ClassVar[Sequence[Measure]] = ()
     has_results_path: ClassVar[bool] = True  # lerobot-eval writes the records, with --env.results_path
     # an episode's number in its evaluation, not its seed, chooses how it starts: in batches of one

@@ -34,12 +34,21 @@ def section(report: Report) -> Section:
     bars = outcomes(report)
     svg = stacked(title, bars.header[2:], bars)
     told = [_told(report.label(group), group) for group in report.groups if not _all_succeed(group)]
-    chart = Chart(title, svg, [bars, *map(failures, report.groups)], "Each bar is 100 % of its episodes.")
+    note = f"Each bar is 100 % of its episodes. {_meanings(report.groups)}".strip()
+    chart = Chart(title, svg, [bars, *map(failures, report.groups)], note)
     return Section(TITLE, [], statements=told[:MAX_TOLD], charts=[chart])
 
 
 def _all_succeed(group: Group) -> bool:
     return all(each.is_success for each in group.records)
+
+
+def _meanings(groups: Sequence[Group]) -> str:
+    """Say what the classes that occur mean: 'imprecise: nearest to the target, but ...'."""
+    met = {each.failure for group in groups for each in group.records}
+    types = dict.fromkeys(group.record_type for group in groups)
+    told = [f"{each}: {each.meaning}" for kind in types for each in kind.failures if each in met]
+    return f"{'. '.join(told)}." if told else ""
 
 
 def _told(name: str, group: Group) -> Statement:
