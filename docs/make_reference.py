@@ -6,7 +6,7 @@
 import dataclasses
 from argparse import SUPPRESS, Action
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
@@ -17,12 +17,14 @@ from lerobot.envs import EnvConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 from policy_flags import FILLED_IN, groups_of, shared_fields
 
+from lerobot_bomb.bomb.perturbations import AXES
 from lerobot_bomb.commands.main import Parser, command_parser
 from lerobot_bomb.commands.table import COMMANDS, PROGRAM
-from lerobot_bomb.conditions import MAX_LEVEL, Axis
-from lerobot_bomb.environments import ENVIRONMENTS
+from lerobot_bomb.conditions import Axis
+from lerobot_bomb.environments import BOMB, ENVIRONMENTS
 from lerobot_bomb.policies.config import VlaConfig
 from lerobot_bomb.results.record import Record
+from lerobot_bomb.viewing.perturbations_page import sizes_table
 
 FOLDER = Path(__file__).parent / "reference"
 JSON_KINDS = {bool: "true or false", int: "whole number", float: "number", str: "text", Any: "any"}
@@ -165,25 +167,42 @@ def record_types() -> Sequence[type[Record]]:
 
 
 def axes_page() -> str:
-    """Every perturbation axis with its levels."""
-    levels = " | ".join(map(str, range(1, MAX_LEVEL + 1)))
+    """Every perturbation axis with its levels; those of `bomb` have a page with pictures."""
     lines = [
-        "# Perturbation axes",
+        "# Perturbation axes of PushT and LIBERO",
         "",
-        "What each axis changes at its levels. How conditions are written, with pictures:",
+        "What each axis changes at its levels. How conditions are written, and the axes of `bomb`:",
         "[perturbations](../perturbations.md).",
         "",
     ]
-    first: dict[str, str] = {}  # {text of an axis: the environment that has it first}
-    for record_type in record_types():
-        for name, axis in record_type.condition.axes.items():
-            env_type = record_type.env_type
-            text = [f"{_summary(axis)}{_sheet(env_type, name)}", ""]
-            rows = table(f"quantity | {levels} | unit | meaning", _magnitudes(axis))
-            like = first.setdefault("\n".join([_summary(axis), *rows]), env_type)
-            same = [f"Its levels are [those of {like}](#{like}-{name}).", ""]
-            lines += [f"## {env_type}: {name}", "", *text, *(rows if like == env_type else same)]
+    # {text of an axis: the environment that has it first, and the link}
+    first = {_axis_text(axis): ("bomb", f"../perturbations.md#{name}") for name, axis in AXES.items()}
+    for env_type, axes in own_axes().items():
+        for name, axis in axes.items():
+            own = (env_type, f"#{env_type}-{name}")
+            like, link = first.setdefault(_axis_text(axis), own)
+            rows = (
+                sizes_table(axis) if (like, link) == own else [f"Its levels are [those of {like}]({link})."]
+            )
+            lines += [
+                f"## {env_type}: {name}",
+                "",
+                f"{_summary(axis)}{_sheet(env_type, name)}",
+                "",
+                *rows,
+                "",
+            ]
     return "\n".join(lines)
+
+
+def own_axes() -> dict[str, Mapping[str, Axis]]:
+    """{env type other than `bomb`: its axes}."""
+    types = {each.env_type: each.condition.axes for each in record_types()}
+    return {name: axes for name, axes in types.items() if name != BOMB.name}
+
+
+def _axis_text(axis: Axis) -> str:
+    return "\n".join([_summary(axis), *sizes_table(axis)])
 
 
 def _summary(axis: Axis) -> str:
@@ -191,14 +210,8 @@ def _summary(axis: Axis) -> str:
     return summary + " Not part of `all`: it helps." * axis.is_help
 
 
-def _magnitudes(axis: Axis) -> Iterator[list[str]]:
-    for quantity, size in axis.magnitudes.items():
-        yield [quantity, *(f"{value:g}" for value in size.levels), size.unit, size.what]
-
-
 def _sheet(env_type: str, axis: str) -> str:
-    folder = "perturbations" if env_type == "bomb" else env_type
-    path = f"media/{folder}/{axis}.jpg"
+    path = f"media/{env_type}/{axis}.jpg"
     return f" [Pictures](../{path})." if (FOLDER.parent / path).is_file() else ""
 
 

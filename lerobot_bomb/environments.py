@@ -7,7 +7,7 @@ from typing import Any
 
 from lerobot_bomb.registry import Registry
 
-STOCK = "lerobot_bomb.results.stock:stock_result"
+UNREGISTERED = "lerobot_bomb.results.stock:unregistered_result"
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class EnvType:
     @property
     def record(self) -> Any:
         """Type of its episodes' records."""
-        return resolve_name(self.record_at) if self.record_at else resolve_name(STOCK)(self.name)
+        return resolve_name(self.record_at) if self.record_at else resolve_name(UNREGISTERED)(self.name)
 
     @property
     def view(self) -> Any:

@@ -104,9 +104,9 @@ def _steps(result: Values) -> str:
 
 
 def turned_right(result: Values, masked: Mapping[str, Values]) -> list[str]:
-    """Return which changes of what it is given lead a failed episode's stone to the right place."""
+    """Return which hidden inputs lead a failed episode's stone to the right place."""
     succeeded, right = turning(result, masked)
-    told = [f"With {_changes(succeeded)} in every step, it succeeds."] if succeeded else []
+    told = [f"With {_any_of(succeeded)} hidden in every step, it succeeds."] if succeeded else []
     if right:
         there = _intersection(result["target"])
         where = f"the stone is put down at the right intersection, {there}"
@@ -114,14 +114,18 @@ def turned_right(result: Values, masked: Mapping[str, Values]) -> list[str]:
             where += f", not at {_intersection(result['nearest_intersection'])}"
         failures = in_a_row(list(dict.fromkeys(masked[name]["failure"] for name in right)))
         where += f", though the episode still fails ({failures})"
-        told.append(f"With {_changes(right)} in every step, {where}.")
+        told.append(f"With {_any_of(right)} hidden in every step, {where}.")
     return told
 
 
 def turning(result: Values, masked: Mapping[str, Values]) -> tuple[list[str], list[str]]:
-    """Return the masks under which a failed episode succeeds, and those that only turn it to its target."""
+    """Return the masks under which a failed episode succeeds, and those that only turn it to its target.
+
+    A mask that names another target is none of them: what was asked for first is then the wrong place.
+    """
     if result["is_success"]:
         return [], []
+    masked = {name: each for name, each in masked.items() if is_hidden(name)}
     succeeded = [name for name, each in masked.items() if each["is_success"]]
     others = [] if _is_at_target(result) else [name for name in masked if name not in succeeded]
     return succeeded, [name for name in others if _is_at_target(masked[name])]
@@ -134,16 +138,9 @@ def _is_at_target(result: Values) -> bool:
     return tuple(result["nearest_intersection"]) == tuple(result["target"])
 
 
-def _changes(masks: Sequence[str]) -> str:
-    """Return "the stone or the word for row hidden, or another row named,"; without commas if all hide."""
-    hidden = [subject(each) for each in masks if is_hidden(each)]
-    named = [subject(each) for each in masks if not is_hidden(each)]
-    ways = [
-        f"{in_a_row(first_of(names, MAX_NAMES), 'or')} {verb}"
-        for names, verb in ((hidden, "hidden"), (named, "named"))
-        if names
-    ]
-    return ways[0] if len(ways) == 1 else f"{', or '.join(ways)},"
+def _any_of(masks: Sequence[str]) -> str:
+    """Return "the stone or the word for row"."""
+    return in_a_row(first_of([*map(subject, masks)], MAX_NAMES), "or")
 
 
 def with_masks(masked: Mapping[str, Values]) -> list[str]:

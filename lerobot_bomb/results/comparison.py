@@ -63,7 +63,7 @@ def describe_verdict(compared: PairedComparison, first: str = "A", second: str =
     counts = compared.counts
     pairs = f"{counts.n} pair{'s' * (counts.n != 1)}"
     if counts.difference == 0:
-        return f"they tie ({counts.first} successes each in {pairs})"
+        return f"they tie ({counts.first} success{'es' * (counts.first != 1)} each in {pairs})"
     low, high = compared.interval
     better, low, high = (first, -high, -low) if counts.difference < 0 else (second, low, high)
     points = f"{100 * abs(counts.difference):.0f} points [{100 * low:.0f}, {100 * high:.0f}]"

@@ -64,8 +64,8 @@ def check_any(path: Path, records: Collection[object], damages: list[str]) -> No
         raise ValueError(f"{path} is no results file; name one that --env.results_path of lerobot-eval wrote")
     if not records:
         raise ValueError(
-            f"{path}: no finished episode; lerobot-eval writes a record when one ends: start it (again) with "
-            f"--env.results_path={path}"
+            f"{path}: no finished episode; a record is written when one ends. Start lerobot-eval again with "
+            "this --env.results_path, or resume the sweep of this folder"
         )
 
 

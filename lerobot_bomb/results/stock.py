@@ -77,13 +77,7 @@ class StockResult(Record):
         return [*cls.env_flags(flags), "--eval.use_async_envs=false"]
 
 
-@cache
-def stock_result(env_type: str) -> type[StockResult]:
-    """Return the type of the records of an env type of which only its name is known."""
-    return _stock_result(env_type)
-
-
-def _stock_result(env_type: str, **facts: Any) -> type[StockResult]:
+def stock_result(env_type: str, **facts: Any) -> type[StockResult]:
     """Make the type of the records of an env type; `facts` are its class variables."""
     version = f"lerobot-{env_type}-1.0"
     packages = (f"gym-{env_type}", env_type, "gymnasium", "mujoco")
@@ -99,10 +93,11 @@ def _stock_result(env_type: str, **facts: Any) -> type[StockResult]:
     )
 
 
-StockPushTResult = _stock_result(
+unregistered_result = cache(stock_result)  # of an env type of which only the name is known
+StockPushTResult = stock_result(
     "pusht", tasks=("PushT-v0",), simulator=pusht.SIMULATOR, drawn_size=f"{IMAGE_SIZE}x{IMAGE_SIZE}"
 )
-StockLiberoResult = _stock_result(
+StockLiberoResult = stock_result(
     "libero", tasks=SUITES, suite_sizes=TASKS_PER_SUITE, simulator=SIMULATOR, starts_by_number=True
 )
-StockLiberoPlusResult = _stock_result("libero_plus", simulator=SIMULATOR, starts_by_number=True)
+StockLiberoPlusResult = stock_result("libero_plus", simulator=SIMULATOR, starts_by_number=True)

@@ -158,9 +158,10 @@ class LastLine(io.TextIOBase):
 
 
 def describe(error: BaseException) -> str:
-    """Describe an error as 'ValueError: its last line'."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[-1]}" if lines else type(error).__name__
+    """Describe an error as 'ValueError: its first line ... its last line'."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    ends = dict.fromkeys([*lines[:1], *lines[-1:]])
+    return ": ".join([type(error).__name__, *filter(None, [" ... ".join(ends)])])
 
 
 def run_worker(folder: str, part: str, run: str, told: str) -> None:

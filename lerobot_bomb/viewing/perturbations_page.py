@@ -6,7 +6,7 @@ from pathlib import Path
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.perturbations import AXES
-from lerobot_bomb.conditions import ALL, MAX_LEVEL, Axis
+from lerobot_bomb.conditions import ALL, EACH, MAX_LEVEL, Axis
 from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.files import written_whole
 
@@ -21,7 +21,7 @@ How an episode may differ from the nominal one, and by how much.
 
 ```
 lerobot-eval --policy.path=CHECKPOINT --env.type=bomb --eval.n_episodes=100 --eval.batch_size=10 \\
-    --env.perturbations='["none","camera:3","camera:2+light:3","all:1-5"]'
+    --env.perturbations='["none","each:3","camera:2+light:3","all:1-5"]'
 lerobot-bomb view --env.perturbations=camera:3 --seed=7
 lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/gallery
 ```
@@ -34,12 +34,14 @@ lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/galle
   `none,camera:3`.
 - A **range** such as `camera:1-5` draws the level from the seed. Each axis of `all:1-5` draws its own
   level.
-- `{ALL}:k` is every axis at level k except `goal_marker`, which makes the task easier.
+- `{ALL}:3` is one condition: every axis at level 3, except `goal_marker`, which makes the task easier.
+- `{EACH}:3` stands for ten conditions, each of these axes alone at level 3; `{EACH}:1-5` for fifty.
+  Only lists of conditions take it.
 
 Each condition is a group in `eval_info.json`, such as `place.camera-2.light-3` or `place.all-1to5`.
 Everything needed stays in view, and the instruction stays unambiguous.
 
-Each picture names the magnitudes of its levels; [all of them as tables](reference/axes.md).
+The tables give the size of each level. [Axes of PushT and LIBERO](reference/axes.md).
 """
 
 
@@ -72,9 +74,21 @@ def example_instructions() -> list[str]:
 
 
 def axis_section(name: str, axis: Axis, sheets: str) -> str:
-    """Write an axis' heading, what it changes, and a link to its sheet, which names the magnitudes."""
+    """Write an axis' heading, what it changes by how much, and a link to its sheet."""
     changes = f"Changes: {', '.join(axis.changes)}."
-    return f"## {name}\n\n{axis.summary[0].upper()}{axis.summary[1:]}. {changes}\n\n{_image(name, sheets)}"
+    told = f"{axis.summary[0].upper()}{axis.summary[1:]}. {changes}"
+    return "\n".join([f"## {name}", "", told, "", *sizes_table(axis), "", _image(name, sheets)])
+
+
+def sizes_table(axis: Axis) -> list[str]:
+    """Return an axis's magnitudes as a table: a row for each quantity, a column for each level."""
+    rows = [
+        [quantity, *(f"{value:g}" for value in size.levels), size.unit, size.what]
+        for quantity, size in axis.magnitudes.items()
+    ]
+    header = ["quantity", *map(str, LEVELS), "unit", "meaning"]
+    head, *lines = [f"| {' | '.join(line)} |" for line in (header, *rows)]
+    return [head, f"|{'---|' * len(header)}", *lines]
 
 
 def _image(name: str, sheets: str) -> str:

@@ -5,12 +5,14 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from inspect import signature
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from lerobot_bomb.compat.hooks.replace import replace
 from lerobot_bomb.compat.use import is_ours
 
+AGAIN = "The same command runs all of them again; lerobot-bomb sweep resumes"
 BEGIN = "begin_evaluation"  # method of our vector environments
 
 
@@ -71,10 +73,9 @@ def tell_of_evaluations() -> None:
             try:
                 return usual(*args, **options)
             except KeyboardInterrupt:
-                if path := getattr(given["env"], "results_path", None):
-                    logging.info(
-                        "%s has the episodes that ended; to be able to resume: lerobot-bomb sweep", path
-                    )
+                path = getattr(given["env"], "results_path", None)
+                if path is not None and Path(path).is_file():
+                    logging.info("%s has the episodes that ended. %s", path, AGAIN)
                 raise
 
         return eval_policy
