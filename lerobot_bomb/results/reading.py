@@ -10,7 +10,7 @@ from typing import Any
 from lerobot_bomb.environments import ENVIRONMENTS
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.results.schema import Schema
-from lerobot_bomb.results.stock import stock_result
+from lerobot_bomb.results.stock import unregistered_result
 
 STOCK_VERSION = r"lerobot-(\w+)-1\.0"  # of an env type of LeRobot's own
 
@@ -20,7 +20,7 @@ def record_type_of(version: str) -> type[Record] | None:
     """Return the type of the records of a protocol version; None: no environment has it."""
     types = (each.record for each in ENVIRONMENTS.values())
     stock = re.fullmatch(STOCK_VERSION, version)
-    return next((each for each in types if version in each.versions), stock and stock_result(stock[1]))
+    return next((each for each in types if version in each.versions), stock and unregistered_result(stock[1]))
 
 
 @cache
