@@ -24,17 +24,11 @@ from lerobot_bomb.conditions import Axis
 from lerobot_bomb.environments import BOMB, ENVIRONMENTS
 from lerobot_bomb.policies.config import VlaConfig
 from lerobot_bomb.results.record import Record
-from lerobot_bomb.viewing.perturbations_page import sizes_table
+from lerobot_bomb.tables import markdown_table
+from lerobot_bomb.viewing.perturbations_page import sizes_table, summary_of
 
 FOLDER = Path(__file__).parent / "reference"
 JSON_KINDS = {bool: "true or false", int: "whole number", float: "number", str: "text", Any: "any"}
-
-
-def table(header: str, rows: Iterable[Iterable[str]]) -> list[str]:
-    """Lay out rows of cells under a header, `a | b`, as Markdown."""
-    rule = "---|" * len(header.split("|"))
-    cells = (" | ".join(cell.replace("|", "\\|") for cell in row) for row in rows)
-    return [f"| {header} |", f"|{rule}", *(f"| {row} |" for row in cells), ""]
 
 
 def argument_rows(parser: Parser) -> dict[str, str]:
@@ -85,7 +79,7 @@ def commands_page() -> str:
                 summary = f"{command.summary[0].upper()}{command.summary[1:]}."
                 lines += [f"### {name}", "", summary, "", "```", *examples, "```", ""]
                 rows = [row for row in arguments[name].items() if row not in linked]
-                lines += table("argument | meaning", rows) if rows else []
+                lines += markdown_table("argument | meaning", rows) if rows else []
                 flags = ", ".join(f"`{_long(row[0])}`" for row in arguments[name].items() if row in linked)
                 lines += [f"[The environment's flags](environments.md): {flags}.", ""] if flags else []
     return "\n".join(lines)
@@ -112,7 +106,7 @@ def environments_page() -> str:
             [f"`--env.{each.name}`", default_of(each), meaning_of(config_class, each.name)]
             for each in own_fields(config_class)
         ]
-        lines += [f"## {env_type}", "", *table("flag | default | meaning", rows)]
+        lines += [f"## {env_type}", "", *markdown_table("flag | default | meaning", rows)]
     return "\n".join(lines)
 
 
@@ -149,9 +143,11 @@ def group_table(title: str, meanings: dict[str, str], types: dict[str, type]) ->
     if not meanings:
         return []
     if title == FILLED_IN:
-        rows = table("field | meaning", [[f"`{name}`", meaning] for name, meaning in meanings.items()])
+        rows = markdown_table(
+            "field | meaning", [[f"`{name}`", meaning] for name, meaning in meanings.items()]
+        )
     else:
-        rows = table(
+        rows = markdown_table(
             " | ".join(["flag", *types, "meaning"]),
             [
                 [f"`--policy.{name}`", *(default_in(each, name) for each in types.values()), meaning]
@@ -176,22 +172,14 @@ def axes_page() -> str:
         "",
     ]
     # {text of an axis: the environment that has it first, and the link}
-    first = {_axis_text(axis): ("bomb", f"../perturbations.md#{name}") for name, axis in AXES.items()}
+    first = {_axis_text(axis): (BOMB.name, f"../perturbations.md#{name}") for name, axis in AXES.items()}
     for env_type, axes in own_axes().items():
         for name, axis in axes.items():
-            own = (env_type, f"#{env_type}-{name}")
-            like, link = first.setdefault(_axis_text(axis), own)
-            rows = (
-                sizes_table(axis) if (like, link) == own else [f"Its levels are [those of {like}]({link})."]
-            )
-            lines += [
-                f"## {env_type}: {name}",
-                "",
-                f"{_summary(axis)}{_sheet(env_type, name)}",
-                "",
-                *rows,
-                "",
-            ]
+            own = f"#{env_type}-{name}"
+            like, link = first.setdefault(_axis_text(axis), (env_type, own))
+            same = [f"Its levels are [those of {like}]({link}).", ""]
+            rows = sizes_table(axis) if link == own else same
+            lines += [f"## {env_type}: {name}", "", f"{_summary(axis)}{_sheet(env_type, name)}", "", *rows]
     return "\n".join(lines)
 
 
@@ -206,8 +194,7 @@ def _axis_text(axis: Axis) -> str:
 
 
 def _summary(axis: Axis) -> str:
-    summary = f"{axis.summary[0].upper()}{axis.summary[1:]}. Changes: {', '.join(axis.changes)}."
-    return summary + " Not part of `all`: it helps." * axis.is_help
+    return summary_of(axis) + " Not part of `all`: it helps." * axis.is_help
 
 
 def _sheet(env_type: str, axis: str) -> str:
@@ -233,10 +220,10 @@ def records_page() -> str:
     for own, types in alike.items():
         versions = ", ".join(f"`{list(each.versions)[-1]}`" for each in types)
         lines += [f"## {', '.join(each.env_type for each in types)}", "", f"Protocol {versions}.", ""]
-        lines += table("field | JSON | meaning", own)
-    lines += ["## All environments", "", *table("field | JSON | meaning", shared)]
+        lines += markdown_table("field | JSON | meaning", own)
+    lines += ["## All environments", "", *markdown_table("field | JSON | meaning", shared)]
     for name, inner in {name: each for types in rows for name, each in nested_in(types).items()}.items():
-        lines += [f"## {name}", "", *table("field | JSON | meaning", _rows(inner, name))]
+        lines += [f"## {name}", "", *markdown_table("field | JSON | meaning", _rows(inner, name))]
     return "\n".join(lines)
 
 

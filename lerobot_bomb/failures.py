@@ -5,7 +5,7 @@ from typing import Self
 
 
 class FailureClass(StrEnum):
-    """Reason why an episode failed; exactly one per failed episode."""
+    """Enum of failure classes, each with a value, which records hold, and a meaning."""
 
     meaning: str  # completes "the episode ended with"
 

@@ -1,6 +1,6 @@
 """Tables of text."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 MAX_NAME = 36  # characters of a name in a table or chart
 
@@ -41,3 +41,10 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], left: Coll
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     for row in [header, *rows]:
         print("  ".join(map(lambda align, *cell: align(*cell), aligned, row, widths)).rstrip())
+
+
+def markdown_table(header: str, rows: Iterable[Iterable[str]]) -> list[str]:
+    """Lay out rows of cells under a header, `a | b`, as lines of Markdown, the last of them empty."""
+    rule = "---|" * len(header.split("|"))
+    cells = (" | ".join(cell.replace("|", "\\|") for cell in row) for row in rows)
+    return [f"| {header} |", f"|{rule}", *(f"| {row} |" for row in cells), ""]

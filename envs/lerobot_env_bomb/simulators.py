@@ -9,7 +9,7 @@ import warnings
 from types import ModuleType
 
 
-def check_simulator(simulator: str, render_preset: str) -> None:
+def check_simulator(simulator: str = "", render_preset: str = "") -> None:
     """Raise a ValueError unless simulator and renderer are installed."""
     asked = {"--env.simulator": simulator, "--env.render_preset": render_preset}
     flags = [f"{flag}=sapien" for flag, value in asked.items() if value == "sapien"]

@@ -226,12 +226,14 @@ class Judge:
         )
 
     def _was_dropped(self, stone: int) -> bool:
-        xy = self._now.stone_xyz[stone, :2]
-        off_m = np.linalg.norm(xy - BOARD.intersection_xy(*BOARD.nearest_intersection(xy)))
-        return bool(
-            off_m > OFF_BOARD_M
-            or self._last_touched_z[stone] > self._episode.layout.rest_height_m + DROP_HEIGHT_M
-        )
+        highest_m = self._episode.layout.rest_height_m + DROP_HEIGHT_M
+        return is_off_board(self._now.stone_xyz[stone, :2]) or bool(self._last_touched_z[stone] > highest_m)
+
+
+def is_off_board(xy: np.ndarray) -> bool:
+    """Return True if a world xy, in metres, is too far from every intersection for a stone to be placed."""
+    off_m = np.linalg.norm(xy - BOARD.intersection_xy(*BOARD.nearest_intersection(xy)))
+    return bool(off_m > OFF_BOARD_M)
 
 
 def _stones_left(move: Move, made: Made) -> frozenset[int]:

@@ -112,7 +112,7 @@ def complete_evaluation(config: Any) -> None:
     """Fill in the values of LeRobot's EvalPipelineConfig that its policy's checkpoint knows.
 
     Raises:
-        FlagError: the evaluation would record several episodes.
+        FlagError: the evaluation would run no episode, or record several.
     """
     check_eval_flags(config)
     if hasattr(config.env, "take_image_size"):

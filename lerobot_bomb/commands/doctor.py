@@ -114,11 +114,10 @@ def check_sapien() -> Iterator[Component]:
         "simulator": lambda: simulators.import_with_sapien("sapien_physics") and "can run",
         "render_preset": lambda: simulators.import_with_sapien("sapien_render").device_name(),
     }
-    own = {"simulator": "mujoco", "render_preset": "fast"}
     for name, check in checks.items():
         flag = f"--env.{name}=sapien"
         try:
-            simulators.check_simulator(**(own | {name: "sapien"}))
+            simulators.check_simulator(**{name: "sapien"})
             yield Component(flag, check())
         except ValueError as error:
             yield Component(flag, str(error), absent=True)

@@ -62,7 +62,6 @@ class Recording(BaseRecording):
         if self.static:
             self._of_scenes()
         self._check(self.perturbations, self.noise)
-        suites_of(self.task)  # raises if there are none
         if self.task_ids and self.task == ALL:
             raise ValueError(
                 f"--env.task_ids={list(self.task_ids)} are numbers in a suite; --env.task={ALL} is of all"

@@ -27,8 +27,11 @@ class LiberoFailure(FailureClass):
     UNFINISHED = "unfinished", "anything else"
     # of the scripted expert, whatever the gripper touched
     NO_GRASP = "no_grasp", "the expert's planner found no free grasp"
-    NO_PLACE = "no_place", "it found no free place that the goal accepts and a grasp leads to"
-    NO_PATH = "no_path", "it found no free path of the gripper"
+    NO_PLACE = (
+        "no_place",
+        "the expert's planner found no free place that the goal accepts and a grasp leads to",
+    )
+    NO_PATH = "no_path", "the expert's planner found no free path of the gripper"
 
 
 @dataclass(frozen=True)

@@ -88,10 +88,10 @@ def _paint_board(axes: "Axes", target_xy: Sequence[float] | None) -> None:
 
 def _show_all(axes: "Axes", stones_xy: Sequence[np.ndarray]) -> None:
     """Show the workspace, and stones that ended outside of it."""
-    lowest = np.min([*stones_xy, np.array(WORKSPACE_LOW_M[:2]) - (0.01, 0)], axis=0) - 0.01
-    highest = np.max([*stones_xy, np.array(WORKSPACE_HIGH_M[:2])], axis=0) + 0.01
-    axes.set_xlim(lowest[0], highest[0])
-    axes.set_ylim(lowest[1], highest[1])
+    shown = np.array([WORKSPACE_LOW_M[:2], WORKSPACE_HIGH_M[:2], *stones_xy])
+    (left, bottom), (right, top) = shown.min(axis=0), shown.max(axis=0)
+    axes.set_xlim(left - 0.02, right + 0.01)
+    axes.set_ylim(bottom - 0.01, top + 0.01)
 
 
 def _paint_path(axes: "Axes", number: int, name: str, run: EpisodeRun) -> None:

@@ -3,10 +3,7 @@
 from collections.abc import Mapping, Sequence
 from html import escape
 
-import numpy as np
-
-from lerobot_bomb.bomb.board import BOARD
-from lerobot_bomb.bomb.episode import OFF_BOARD_M
+from lerobot_bomb.bomb.judge import is_off_board
 from lerobot_bomb.explain.counterfactuals import Counterfactual, settled_by
 from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.facts import turning
@@ -102,11 +99,11 @@ def _outcome(run: EpisodeRun) -> list[Cell]:
         return [Cell(outcome), Cell("-"), Cell("-"), Cell("-")]
     row, column = result.nearest_intersection
     error_mm = result.placement_error_mm
-    off_m = np.linalg.norm(run.stone_xyz[-1, :2] - BOARD.intersection_xy(row, column))
+    is_off = is_off_board(run.stone_xyz[-1, :2])
     return [
         Cell(outcome),
         Cell(str(result.steps), result.steps),
-        Cell("off the board" if off_m > OFF_BOARD_M else f"row {row}, column {column}"),
+        Cell("off the board" if is_off else f"row {row}, column {column}"),
         Cell(f"{error_mm:.1f}", error_mm),
     ]
 

@@ -160,8 +160,8 @@ class LastLine(io.TextIOBase):
 def describe(error: BaseException) -> str:
     """Describe an error as 'ValueError: its first line ... its last line'."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    ends = dict.fromkeys([*lines[:1], *lines[-1:]])
-    return ": ".join([type(error).__name__, *filter(None, [" ... ".join(ends)])])
+    told = " ... ".join(dict.fromkeys([*lines[:1], *lines[-1:]]))
+    return f"{type(error).__name__}: {told}" if told else type(error).__name__
 
 
 def run_worker(folder: str, part: str, run: str, told: str) -> None:

@@ -9,6 +9,7 @@ from lerobot_bomb.bomb.perturbations import AXES
 from lerobot_bomb.conditions import ALL, EACH, MAX_LEVEL, Axis
 from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.files import written_whole
+from lerobot_bomb.tables import markdown_table
 
 # the episode whose instructions the page quotes
 SEED, TARGET, COLOR = 0, (3, 4), "black"
@@ -75,9 +76,12 @@ def example_instructions() -> list[str]:
 
 def axis_section(name: str, axis: Axis, sheets: str) -> str:
     """Write an axis' heading, what it changes by how much, and a link to its sheet."""
-    changes = f"Changes: {', '.join(axis.changes)}."
-    told = f"{axis.summary[0].upper()}{axis.summary[1:]}. {changes}"
-    return "\n".join([f"## {name}", "", told, "", *sizes_table(axis), "", _image(name, sheets)])
+    return "\n".join([f"## {name}", "", summary_of(axis), "", *sizes_table(axis), _image(name, sheets)])
+
+
+def summary_of(axis: Axis) -> str:
+    """Return what an axis is, and what it changes."""
+    return f"{axis.summary[0].upper()}{axis.summary[1:]}. Changes: {', '.join(axis.changes)}."
 
 
 def sizes_table(axis: Axis) -> list[str]:
@@ -86,9 +90,7 @@ def sizes_table(axis: Axis) -> list[str]:
         [quantity, *(f"{value:g}" for value in size.levels), size.unit, size.what]
         for quantity, size in axis.magnitudes.items()
     ]
-    header = ["quantity", *map(str, LEVELS), "unit", "meaning"]
-    head, *lines = [f"| {' | '.join(line)} |" for line in (header, *rows)]
-    return [head, f"|{'---|' * len(header)}", *lines]
+    return markdown_table(" | ".join(["quantity", *map(str, LEVELS), "unit", "meaning"]), rows)
 
 
 def _image(name: str, sheets: str) -> str:
@@ -97,6 +99,6 @@ def _image(name: str, sheets: str) -> str:
 
 def _forms(instructions: list[str]) -> str:
     """Return the table of one goal, said in the form of each level."""
-    rows = [f"| {level} | {instruction} |" for level, instruction in enumerate(instructions)]
+    rows = [(str(level), instruction) for level, instruction in enumerate(instructions)]
     head = f"One goal, a {COLOR} stone on row {TARGET[0]}, column {TARGET[1]}, in the form of each level:"
-    return "\n".join(["", head, "", "| level | instruction |", "|---|---|", *rows, ""])
+    return "\n".join(["", head, "", *markdown_table("level | instruction", rows)])
