@@ -14,6 +14,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from result_rows import row
 from rrd_files import Logged, read_rrd, scalars
 
 from lerobot_bomb.bomb.board import BOARD
@@ -23,8 +24,11 @@ from lerobot_bomb.bomb.observation import ACTION_NAMES, STATE_NAMES, RenderOptio
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.envs.rollout import expert_agent, make_env, run_episode
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.reading import parse_record
 from lerobot_bomb.viewing.bomb import bomb_episode
 from lerobot_bomb.viewing.episode import ViewedRun, write_episodes
+from lerobot_bomb.viewing.rerun_bomb import BombLog
 from lerobot_bomb.viewing.sheet import BAR_HEIGHT, title_bar
 from lerobot_env_bomb.env import BombEnv
 
@@ -133,9 +137,9 @@ def test_words_say_instruction_stages_and_result(logged: Logged, run: Run) -> No
 
 
 def test_both_timelines_tell_the_same(logged: Logged) -> None:
-    for step, row in logged["/camera/wrist"].items():
+    for step, logged_row in logged["/camera/wrist"].items():
         assert step is not None
-        assert row["time"].total_seconds() == pytest.approx(step / SPEC.fps)
+        assert logged_row["time"].total_seconds() == pytest.approx(step / SPEC.fps)
 
 
 def test_the_viewer_is_told_what_to_show(viewed: Path) -> None:
@@ -315,6 +319,16 @@ def test_that_a_file_exists_is_told_last(
 )
 def test_files_are_named_after_the_task(fixed: dict[str, Any], name: str) -> None:
     assert bomb_episode(EpisodeSpec(seed=4, **fixed), OPTIONS).name("expert") == name
+
+
+@pytest.mark.parametrize(
+    ("failure", "is_near"),
+    [("wrong_intersection", True), ("imprecise", True), ("dropped", False), ("timeout_holding", False)],
+)
+def test_only_a_stone_that_was_put_down_is_near_an_intersection(failure: str, is_near: bool) -> None:
+    result = parse_record(row(0, failure).encode())
+    assert isinstance(result, EpisodeResult)
+    assert ("nearest to row" in BombLog.describe(result)) == is_near
 
 
 @pytest.mark.parametrize("task_id", [0, 2])  # into the tray; two stones change places

@@ -10,7 +10,7 @@ from lerobot_bomb.bomb.move import place_name
 from lerobot_bomb.bomb.observation import ACTION_NAMES, AGENT_POS, CAMERAS, PIXELS, STATE_NAMES
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.envs.rollout import Moment
-from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.bomb import PUT_DOWN, EpisodeResult
 from lerobot_bomb.viewing.rerun_file import EpisodeLog, curve_views, describe_outcome, png, text_views
 
 STONE_RGB = {"black": (25, 25, 28), "white": (240, 240, 235)}
@@ -35,13 +35,15 @@ class BombLog(EpisodeLog[EpisodeSpec, EpisodeResult]):
     def describe(result: EpisodeResult) -> str:
         outcome = describe_outcome(result.is_success, result.failure, result.steps)
         row, column = result.nearest_intersection
-        place = f"nearest to row {row}, column {column}"
+        place = ""  # of a stone that was not put down, and may lie off the board
         if Stage(result.stage) not in (Stage.LIFTED, Stage.PLACED):
-            place = "never lifted"
+            place = ", never lifted"
         elif result.placement_error_mm == 0:  # of an area: no stone lies exactly on an intersection
-            place = "in the tray"
+            place = ", in the tray"
+        elif result.failure in PUT_DOWN:
+            place = f", nearest to row {row}, column {column}"
         moves = "" if result.target else f"{result.progress:.0%} of the moves made; "
-        return f"{outcome}; {moves}the stone is {result.placement_error_mm:.1f} mm from the target, {place}"
+        return f"{outcome}; {moves}the stone is {result.placement_error_mm:.1f} mm from the target{place}"
 
     @staticmethod
     def layout(prefix: str) -> rrb.Horizontal:
