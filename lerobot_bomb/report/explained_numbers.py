@@ -113,7 +113,7 @@ def _restored(restored: PatchingResult) -> list[Table]:
     title = f"Restored after: {restored.corruption}"
     far = "" if restored.moved_mm is None else f"The next action moves {restored.moved_mm:.1f} mm. "
     drop = f"The score drops by {restored.drop:.4g}."
-    note = f"{far}{drop} 1: all of that comes back, 0: none; -: it did not drop."
+    note = f"{far}{drop} 1: all of that comes back, 0: none; -: it did not change."
     num_layers = len(restored.mlps)
     layers = [f"layer {layer}" for layer in range(num_layers)]
     tables = []
