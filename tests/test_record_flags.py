@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import pytest
 from lerobot.envs import EnvConfig
@@ -304,7 +305,9 @@ def test_an_episode_has_the_flags_of_the_environment(command: str) -> None:
     names = {field.name for field in fields(env)} - of_lerobot - {"results_path", "ignore_checkpoint"}
     assert names <= ours.keys()
     assert names <= {field.name for field in fields(Recording)}
-    several = {"task_ids": (), "perturbations": (NONE,)}  # None: one episode of the environment
+    several: dict[str, Any] = {"task_ids": (), "perturbations": (NONE,)}  # None: one episode
+    if command == "record":  # of several environments, each with its own default
+        several["render_preset"] = None
     assert all({f"--env.{name}", f"--{name}"} <= {*flags[name]} for name in names)
     assert {name: ours[name] for name in names} == {name: getattr(env, name) for name in names} | several
 

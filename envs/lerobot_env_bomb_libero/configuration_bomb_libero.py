@@ -16,7 +16,7 @@ from lerobot_bomb.checkpoints.interface import Interface
 from lerobot_bomb.checkpoints.libero_orientation import OrientationCheck
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.libero.assets import SUITES, prepare_libero
-from lerobot_bomb.libero.episode import LIBERO_FPS, STATE_DIM, TASKS_PER_SUITE, LiberoSpec
+from lerobot_bomb.libero.episode import LIBERO_FPS, RENDER_PRESETS, STATE_DIM, TASKS_PER_SUITE, LiberoSpec
 from lerobot_bomb.libero.goals import check_goals
 from lerobot_bomb.libero.perturbations import LiberoCondition
 
@@ -30,6 +30,8 @@ class BombLiberoEnvConfig(EvaluatedEnv, LiberoEnv):
 
     # a suite, or several: libero_spatial,libero_goal
     task: str = SUITES[0]
+    # stock: LIBERO's images; fast: without multisampling, reflections and shadows, in a quarter of the time
+    render_preset: str = RENDER_PRESETS[0]
 
     def _check(self) -> None:
         if not self.init_states:
@@ -37,6 +39,7 @@ class BombLiberoEnvConfig(EvaluatedEnv, LiberoEnv):
         if self.is_libero_plus:
             raise ValueError("--env.is_libero_plus=true: its perturbations are other ones; drop it")
         one_of("--env.control_mode", self.control_mode, CONTROL_MODES)
+        one_of("--env.render_preset", self.render_preset, RENDER_PRESETS)
         _ = self.groups
 
     def _declare_features(self) -> None:
@@ -110,6 +113,7 @@ class BombLiberoEnvConfig(EvaluatedEnv, LiberoEnv):
             "control_mode": self.control_mode,
             "control_freq": self.fps,
             "obs_type": self.obs_type,
+            "render_preset": self.render_preset,
             "observation_height": self.observation_height,
             "observation_width": self.observation_width,
         }

@@ -131,6 +131,7 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
             failure=self._failure,
             levels=dict(episode.perturbation.levels),
             image_size=f"{scene.observation_width}x{scene.observation_height}",
+            render_preset=scene.render_preset,
             control_mode=scene.control_mode,
             fps=scene.control_freq,
             policy=self._policy,

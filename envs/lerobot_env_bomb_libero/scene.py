@@ -10,12 +10,13 @@ from xml.etree import ElementTree
 import numpy as np
 
 from lerobot_bomb.envs.perturbation import EpisodeTransform
-from lerobot_bomb.libero.episode import initial_state_of
+from lerobot_bomb.libero.episode import RENDER_PRESETS, initial_state_of
 from lerobot_env_bomb_libero.stock import LiberoEnv, get_libero_dummy_action, mujoco
 
 CAMERAS = ("agentview", "robot0_eye_in_hand")
 ROBOT_PREFIXES = ("robot0_", "gripper0_", "mount0_")
 FINGERS = "gripper0_"
+HIDDEN_GROUP = 5  # of geoms that are not drawn
 # fields of mjModel that the axes and LIBERO's own reset change
 EDITED = (
     "body_pos", "body_quat", "body_mass", "body_inertia", "body_subtreemass", "body_invweight0",
@@ -49,9 +50,16 @@ class LiberoScene(LiberoEnv):
     Images that nobody sees are not drawn.
     """
 
-    def __init__(self, kinds: Sequence[type[LiberoTransform]], draws: bool = True, **kwargs: Any):
+    def __init__(
+        self,
+        kinds: Sequence[type[LiberoTransform]],
+        draws: bool = True,
+        render_preset: str = RENDER_PRESETS[0],
+        **kwargs: Any,
+    ):
         """Make the scene; with `draws=False` the images of its observations are black."""
         super().__init__(**kwargs)
+        self.render_preset = render_preset
         self._kinds = kinds  # of the axes that may be on
         self._draws = draws
         self._compiled: dict[str, np.ndarray] = {}
@@ -230,6 +238,8 @@ class LiberoScene(LiberoEnv):
 
         def initialize_and_remember(*args: Any, **kwargs: Any) -> None:
             initialize(*args, **kwargs)
+            if self.render_preset == "fast":
+                self._simplify_images()
             self._remember()
 
         inner._initialize_sim = initialize_and_remember
@@ -239,7 +249,7 @@ class LiberoScene(LiberoEnv):
         inner.hard_reset = False
         for camera in self.camera_name:
             observable = inner._observables[camera]
-            observable._sensor = self._drawn_if_on(observable._sensor)
+            observable._sensor = self._drawn_if_on(camera.removesuffix("_image"), observable._sensor)
 
     def _place(self) -> None:
         """Reset robosuite itself; LIBERO's wrapper would retry for ever, whatever the error."""
@@ -264,7 +274,7 @@ class LiberoScene(LiberoEnv):
             kind.add_bodies(worldbody)
         return ElementTree.tostring(root, encoding="unicode")
 
-    def _drawn_if_on(self, sensor: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    def _drawn_if_on(self, camera: str, sensor: Callable[[Any], Any]) -> Callable[[Any], Any]:
         blank = np.zeros((self.observation_height, self.observation_width, 3), np.uint8)
 
         @wraps(sensor)  # robosuite reads attributes of it
@@ -274,9 +284,39 @@ class LiberoScene(LiberoEnv):
             # robosuite draws in the current context: with several environments in one process, that of the
             # last one that was built
             self._opengl.gl_ctx.make_current()
-            return sensor(cache)
+            if self.render_preset == "stock":
+                return sensor(cache)
+            with self._culled(self.model.camera(camera).id):
+                return sensor(cache)
 
         return draw
+
+    def _simplify_images(self) -> None:
+        """Leave out what costs most; call it before the renderer is made, which reads the multisampling."""
+        model = self.model
+        model.vis.quality.offsamples = 0
+        model.mat_reflectance[:] = 0  # each reflecting surface draws the scene once more
+        model.light_castshadow[:] = 0
+
+    @contextmanager
+    def _culled(self, camera: int) -> Iterator[None]:
+        """Hide what a camera does not see: without reflections and shadows, no pixel changes."""
+        groups = self.model.geom_group.copy()
+        self.model.geom_group[self._is_out_of_view(camera)] = HIDDEN_GROUP
+        try:
+            yield
+        finally:
+            self.model.geom_group[:] = groups
+
+    def _is_out_of_view(self, camera: int) -> np.ndarray:
+        """(geoms,) bool: the sphere around a geom lies outside of a camera's view."""
+        model, data = self.model, self.data
+        radius = model.geom_rbound  # 0: an infinite plane
+        local = (data.geom_xpos - data.cam_xpos[camera]) @ data.cam_xmat[camera].reshape(3, 3)
+        aspect = np.array([self.observation_width / self.observation_height, 1])
+        slope = aspect * np.tan(np.radians(model.cam_fovy[camera]) / 2)
+        beyond_m = (abs(local[:, :2]) + slope * local[:, 2:]) / np.hypot(1, slope)  # it looks along -z
+        return (radius > 0) & (beyond_m.max(1) > radius)
 
     @contextmanager
     def _drawing(self, on: bool) -> Iterator[None]:

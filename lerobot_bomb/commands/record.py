@@ -69,6 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"not record the test episodes, {TEST_SEEDS[0]} to {TEST_SEEDS[-1]}",
     )
     add_episode_arguments(parser)
+    parser.set_defaults(render_preset=None)  # each environment has its own default
     add("--images", **switch(), help="store images (lossless) instead of videos")
     add("--workers", type=int, default=1, help="simulator processes; one keeps two cores busy (default: 1)")
     add(
@@ -153,7 +154,7 @@ def _bomb_recording(args: argparse.Namespace) -> Recording:
     if args.image_size is None:
         trained = None if args.policy_path is None else trained_image_size(args.policy_path)
         args.image_size = flags["image_size"] = trained or DEFAULT_IMAGE_SIZE
-    given: dict[str, Any] = {f.name: flags[f.name] for f in fields(Recording) if f.name in flags}
+    given = {f.name: flags[f.name] for f in fields(Recording) if flags.get(f.name) is not None}
     given |= {"episodes": args.episodes or 0, "static": args.static or 0, "relabel": _acting_weights(args)}
     return Recording(**given)
 

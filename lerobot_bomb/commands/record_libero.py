@@ -4,6 +4,7 @@ import argparse
 from dataclasses import fields
 
 from lerobot_bomb.data.libero_recording import LiberoRecording
+from lerobot_bomb.libero.episode import RENDER_PRESETS
 from lerobot_bomb.libero.goals import check_goals
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.libero import LiberoResult
@@ -14,7 +15,7 @@ RECORDING_FLAGS = {each.name for each in fields(LiberoRecording)} - {"env_type"}
 # arguments that bomb alone has
 BOMB_ONLY = (
     "static", "relabel", "policy_path", "pointing", "robot", "control_mode", "fps", "image_size",
-    "render_preset", "depth", "split", "target", "color", "success_tolerance_mm",
+    "depth", "split", "target", "color", "success_tolerance_mm",
 )  # fmt: skip
 # arguments -> flags that are not --NAME
 FLAG_OF = {"policy_path": "policy.path", "env_type": "env.type", **{name: f"env.{name}" for name in SIZES}}
@@ -28,7 +29,8 @@ def add_env_type_arguments(parser: argparse.ArgumentParser) -> None:
         choices=(BOMB, BOMB_LIBERO),
         default=BOMB,
         help="environment (default: bomb); bomb_libero takes --env.task (default: libero_spatial), "
-        "--env.task_ids (default: all), --env.perturbations and the size of its images",
+        "--env.task_ids (default: all), --env.perturbations, the size of its images and "
+        f"--env.render_preset ({', '.join(RENDER_PRESETS)}; default: {LiberoRecording.render_preset})",
     )
     for name in SIZES:
         default = getattr(LiberoRecording, name)
@@ -48,7 +50,7 @@ def libero_recording(args: argparse.Namespace) -> LiberoRecording:
             flag = FLAG_OF.get(name, name)
             raise ValueError(f"--{flag} is of --env.type={BOMB}; leave it out with --env.type={BOMB_LIBERO}")
     given = {name: value for name, value in vars(args).items() if name in RECORDING_FLAGS}
-    left_out = {name for name in (*SIZES, "task") if given[name] == args.default_of(name)}
+    left_out = {name for name in (*SIZES, "render_preset", "task") if given[name] == args.default_of(name)}
     recording = LiberoRecording(**{name: value for name, value in given.items() if name not in left_out})
     check_goals(recording.conditions)
     return recording

@@ -87,7 +87,9 @@ class DatasetFacts:
         """Return lerobot-eval's flags for the dataset's environment; None if unknown."""
         conversion = self.conversion
         if self._is_libero:
-            return ["--env.type=bomb_libero", *self._libero_flags(self.recording["task"])[1:]]
+            preset = self.recording.get("render_preset")
+            flags = [] if preset is None else [f"--env.render_preset={preset}"]
+            return ["--env.type=bomb_libero", *self._libero_flags(self.recording["task"])[1:], *flags]
         if conversion.get("source", "").startswith(PUSHT_SOURCE):
             return ["--env.type=pusht", "--eval.use_async_envs=false"]
         if conversion.get("source", "").startswith(LIBERO_SOURCE):

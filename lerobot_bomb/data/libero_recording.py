@@ -13,8 +13,15 @@ from lerobot_bomb.bomb.streams import recorder_noise
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.data.base_recording import BaseRecording
 from lerobot_bomb.envs.rollout import Agent, Expert, run_episode
+from lerobot_bomb.flags import one_of
 from lerobot_bomb.libero.assets import SUITES
-from lerobot_bomb.libero.episode import LIBERO_PROTOCOL_VERSION, MOTION_DIMS, TASKS_PER_SUITE, LiberoSpec
+from lerobot_bomb.libero.episode import (
+    LIBERO_PROTOCOL_VERSION,
+    MOTION_DIMS,
+    RENDER_PRESETS,
+    TASKS_PER_SUITE,
+    LiberoSpec,
+)
 from lerobot_bomb.libero.expert import LiberoState, libero_expert_action
 from lerobot_bomb.results.libero import SIMULATOR, LiberoResult
 from lerobot_bomb.results.origin import installed_versions
@@ -24,6 +31,7 @@ if TYPE_CHECKING:
 
 # Importing the part before the colon registers the id; no module of the core imports an environment.
 ENV_ID = "lerobot_env_bomb_libero:bomb_libero/Libero-v0"
+IMAGE_SIZE = ("observation_height", "observation_width")
 IMAGE_NAMES = ("image", "image2")  # of LeRobot's environment
 
 
@@ -37,6 +45,7 @@ class LiberoRecording(BaseRecording):
     images: bool = False
     observation_height: int = 256
     observation_width: int = 256
+    render_preset: str = RENDER_PRESETS[0]
     noise: float = 0.0
     env_type: str = LiberoResult.env_type
     protocol_version: str = LIBERO_PROTOCOL_VERSION
@@ -46,7 +55,8 @@ class LiberoRecording(BaseRecording):
 
     def __post_init__(self) -> None:
         self._check(self.perturbations, self.noise)
-        for name in ("observation_height", "observation_width"):
+        one_of("--env.render_preset", self.render_preset, RENDER_PRESETS)
+        for name in IMAGE_SIZE:
             if getattr(self, name) < 1:
                 raise ValueError(f"--env.{name}={getattr(self, name)} must be at least 1")
         if len(set(self.conditions)) < len(self.conditions):
@@ -63,8 +73,8 @@ class LiberoRecording(BaseRecording):
         ]
 
     def rollouts(self, _: Expert) -> "LiberoRollouts":
-        size = {"observation_height": self.observation_height, "observation_width": self.observation_width}
-        return LiberoRollouts(self.noise, {"obs_type": "pixels_agent_pos"} | size)
+        drawn = {name: getattr(self, name) for name in (*IMAGE_SIZE, "render_preset")}
+        return LiberoRollouts(self.noise, {"obs_type": "pixels_agent_pos"} | drawn)
 
     def layout(self) -> "DatasetLayout":
         from lerobot_bomb.data.libero_conversion import libero_layout  # LeRobot: seconds

@@ -16,6 +16,7 @@ LIBERO_FPS = 20  # control steps a second, of its demonstrations and its environ
 MAX_ALLOWED_STEPS = 10_000
 STATE_DIM = 8  # the gripper's position, orientation as axis and angle, and its two fingers
 ACTION_DIM = 7
+RENDER_PRESETS = ("stock", "fast")  # fast: without multisampling, reflections and shadows
 MOTION_DIMS = 6  # change of x, y, z and of orientation; the last is the gripper
 
 

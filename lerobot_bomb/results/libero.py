@@ -6,7 +6,13 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Protocol, Self
 
 from lerobot_bomb.libero.assets import SUITES
-from lerobot_bomb.libero.episode import LIBERO_PROTOCOL_VERSION, TASKS_PER_SUITE, LiberoFailure, LiberoSpec
+from lerobot_bomb.libero.episode import (
+    LIBERO_PROTOCOL_VERSION,
+    RENDER_PRESETS,
+    TASKS_PER_SUITE,
+    LiberoFailure,
+    LiberoSpec,
+)
 from lerobot_bomb.libero.perturbations import LiberoCondition
 from lerobot_bomb.results import schema
 from lerobot_bomb.results.origin import describe_versions, installed_versions
@@ -53,6 +59,8 @@ class LiberoResult(Record):
     env_type: ClassVar = "bomb_libero"
     condition: ClassVar = LiberoCondition
     versions: ClassVar = {LIBERO_PROTOCOL_VERSION: ()}
+    earlier: ClassVar = {**Record.earlier, "render_preset": RENDER_PRESETS[0]}
+    comparable: ClassVar = {"render_preset": ()}
     drawn: ClassVar = ("task_id",)
     start: ClassVar = ("seed", "task_id")  # tasks have scenes of their own
     tasks: ClassVar = SUITES
@@ -65,6 +73,7 @@ class LiberoResult(Record):
     steps: Count  # control steps
     failure: Annotated[str, schema.among(LiberoFailure)] | None
     image_size: str = "256x256"
+    render_preset: Annotated[str, schema.among(RENDER_PRESETS)] = RENDER_PRESETS[0]  # --env.render_preset
     control_mode: str = "relative"  # --env.control_mode
     fps: Count = 20  # control steps per second
     # {package on which the bits of an episode depend: its version}
@@ -80,11 +89,13 @@ class LiberoResult(Record):
             "simulator": describe_versions(self.simulator_versions),
             "control_mode": self.control_mode,
             "fps": str(self.fps),
+            "render_preset": self.render_preset,
         }
 
     @classmethod
     def describe_simulator(cls, settings: Mapping[str, str]) -> str:
-        return f"{settings['control_mode']} control, {settings['fps']} Hz, {settings['simulator']}"
+        drawn = f"render_preset {settings['render_preset']}"
+        return f"{settings['control_mode']} control, {settings['fps']} Hz, {drawn}, {settings['simulator']}"
 
     @classmethod
     def describe_tasks(cls, records: Sequence[Self]) -> str:
@@ -100,5 +111,6 @@ class LiberoResult(Record):
         flags = task_flags([each.spec for each in records])
         flags |= {"control_mode": first.control_mode, "fps": first.fps}
         flags |= {"observation_height": height, "observation_width": width}
+        flags |= {"render_preset": first.render_preset}
         steps = first.spec.max_steps
         return cls.env_flags(flags | ({} if steps is None else {"episode_length": steps}))

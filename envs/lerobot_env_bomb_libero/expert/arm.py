@@ -22,6 +22,7 @@ DAMPING = 0.02
 MAX_TURN_RAD = 0.25  # of a joint in an iteration
 REACHED = (0.002, 0.02)  # metres and radians
 LIMIT_RAD = 0.05  # that joints keep from their limits
+ELBOW, BENT_RAD = 3, 0.8  # a joint, and what it keeps from straight: near there the arm leaves its way
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,7 @@ class Arm:
         self._dofs = np.array([self.model.jnt_dofadr[self._joint_at(address)] for address in joints])
         limits = np.array([self.model.jnt_range[self._joint_at(address)] for address in joints])
         self._low, self._high = limits[:, 0] + LIMIT_RAD, limits[:, 1] - LIMIT_RAD
+        self._high[ELBOW] = -BENT_RAD
         self._fingers = [int(self.model.joint(name).qposadr[0]) for name in FINGER_JOINTS]
         self._site = self.model.site(GRIP).id
         self.rest = self.task.resting_joints()

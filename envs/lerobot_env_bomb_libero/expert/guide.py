@@ -82,4 +82,4 @@ class Guide:
             yield from drag(motion, goal, body, places[0])
         else:
             yield from motion.take(grasp, arm.scene.geoms_of([body]).tolist())
-            yield from carry(motion, goal, body, places)
+            yield from carry(motion, goal, body, places, grasp)

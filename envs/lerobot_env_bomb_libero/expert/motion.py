@@ -17,8 +17,10 @@ PASSING, ARRIVED = (0.025, 0.2), (0.006, 0.05)  # metres and radians
 MAX_STEPS = 70  # to a pose
 SETTLED_STEPS = 12  # without progress
 PROGRESS_M = 0.001
-CLOSE_STEPS, OPEN_STEPS = (7, 14), 6
+CLOSE_STEPS, OPEN_STEPS = 20, 6
+SQUEEZE_STEPS = 5  # after the first touch of both fingers, which does not hold a turn yet
 BACK_M = 0.07  # before a grasp and after it
+CLOSING_M = (0.03, 0.02, 0.01)  # of each finger, where nothing else may be between them
 KEPT_M = 0.001  # between the gripper and everything, at a grasp or a place
 LOST_STEPS = 3
 AROUND_RAD = np.radians(np.arange(0, 360, 30))
@@ -95,8 +97,10 @@ class Motion:
         """
         yield from self.go_along(grasp.pose.shifted(-BACK_M * grasp.approach), None, OPEN)
         yield from self.go(grasp.pose, OPEN, ARRIVED, 0.6)
-        for step in range(CLOSE_STEPS[1]):
-            if step >= CLOSE_STEPS[0] and self.task.is_gripped(geoms):
+        gripped = 0
+        for _ in range(CLOSE_STEPS):
+            gripped = gripped + 1 if self.task.is_gripped(geoms) else 0
+            if gripped > SQUEEZE_STEPS:
                 break
             yield NextPose(grasp.pose, CLOSE)
         if not self.task.is_gripped(geoms):
@@ -123,10 +127,17 @@ class Motion:
                 raise LostError
             yield target
 
-    def is_free(self, grasp: Grasp) -> bool:
-        """Return True if the open gripper comes straight to a grasp."""
+    def is_free(self, grasp: Grasp, geoms: np.ndarray) -> bool:
+        """Return True if the open gripper comes straight to a grasp, and closes on these geoms only."""
         way = [grasp.pose.shifted(-back_m * grasp.approach) for back_m in (BACK_M, BACK_M / 2, 0.0)]
-        return is_free_way(self.arm, way, None, OPEN_M, KEPT_M)
+        if not is_free_way(self.arm, way, None, OPEN_M, KEPT_M):
+            return False
+        is_grasped = np.isin(np.arange(self.arm.model.ngeom), geoms)
+        for opening_m in CLOSING_M:
+            self.arm.set_fingers(opening_m)
+            if self.arm.clearance_m(ignored=is_grasped) < KEPT_M:
+                return False
+        return True
 
 
 def tilted(tilts_rad: Sequence[float]) -> list[np.ndarray]:

@@ -28,7 +28,7 @@ from lerobot_env_bomb_libero.expert.places import turned
 from lerobot_env_bomb_libero.expert.surfaces import surface_of
 
 TILTS_RAD = np.radians([25, 45]).tolist()  # of an approach, if none from above is free
-MAX_TRIED = 60  # grasps
+MAX_TRIED = 400  # grasps
 LOWEST_M = 0.0115  # of the point between the pads above what an object stands on
 TURNS_RAD = np.radians([0, 30, -30, 60, -60, 90, -90, 135, -135, 180]).tolist()  # of an object in its place
 LIFT_M = 0.05
@@ -56,7 +56,7 @@ def choose_grasp(motion: Motion, body: int, places: Sequence[Pose]) -> Grasp:
         count = MAX_POINTS // len(approaches) + 40
         grasps = grasps_of(surface, motion.grip, approaches, lowest_m, count=count)
         for grasp in grasps[:MAX_TRIED]:
-            if not motion.is_free(grasp):
+            if not motion.is_free(grasp, arm.scene.geoms_of([body])):
                 continue
             is_any_free = True
             if _leads_to_place(motion, Held(body, grasp.pose.inverse @ thing), grasp.pose, places):
@@ -87,8 +87,13 @@ def _gripper_at(motion: Motion, held: Held, places: Sequence[Pose]) -> Pose | No
     return None
 
 
-def carry(motion: Motion, goal: Sequence[str], body: int, places: Sequence[Pose]) -> Iterator[NextPose]:
+def carry(
+    motion: Motion, goal: Sequence[str], body: int, places: Sequence[Pose], grasp: Grasp
+) -> Iterator[NextPose]:
     """Carry what is held to a place, and let it go.
+
+    An object that tilted in the grasp is set upright by the place that it is lowered onto, not in the air:
+    near its base the arm cannot roll the gripper, and would lose its way.
 
     Raises:
         NoPlanError: no place or no path is free.
@@ -99,7 +104,8 @@ def carry(motion: Motion, goal: Sequence[str], body: int, places: Sequence[Pose]
     lifted = motion.grip.shifted(-LIFT_M * motion.grip.mat[:, 2])
     yield from motion.while_held(motion.go(lifted, CLOSE, PASSING, 0.6), geoms)
     arm.mirror()
-    held = Held(body, motion.grip.inverse @ arm.body(body))
+    as_grasped = grasp.pose.mat.T @ places[0].mat
+    held = Held(body, Pose((motion.grip.inverse @ arm.body(body)).xyz, as_grasped))
     pose = _gripper_at(motion, held, places)
     if pose is None:
         raise NoPlanError(LiberoFailure.NO_PLACE)

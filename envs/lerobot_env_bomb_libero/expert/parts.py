@@ -122,7 +122,7 @@ def _choose_grasp(motion: Motion, part: MovingPart) -> Grasp:
     )  # fmt: skip
     for grasp in grasps:
         in_part = start.inverse @ grasp.pose
-        if motion.is_free(grasp) and all(
+        if motion.is_free(grasp, part.geoms) and all(
             _can_hold(arm, part, position, pose @ in_part)
             for position, pose in zip(positions, poses, strict=True)
         ):
