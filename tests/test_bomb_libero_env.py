@@ -353,3 +353,37 @@ def test_sync_and_async_workers_see_the_same_bits(libero_with_assets: Libero) ->
         vector.close()
     for one, other in zip(*seen, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.long
+def test_the_fast_preset_draws_the_same_scene_and_says_so(libero_with_assets: Libero) -> None:
+    """Compare with the stock images, and with the fast ones of which nothing out of view is left out."""
+    made = {preset: make_drawn(preset) for preset in ("stock", "fast")}
+    images = {preset: env.reset(seed=3)[0]["pixels"] for preset, env in made.items()}
+    for camera in CAMERAS:
+        stock, fast = (images[preset][camera].astype(float) for preset in ("stock", "fast"))
+        assert (stock != fast).any()
+        assert abs(stock - fast).mean() < 6  # grey levels
+    fast = made["fast"]
+    scene = fast._scene
+    cameras = [scene.model.camera(name).id for name in ("agentview", "robot0_eye_in_hand")]
+    hidden = [scene._is_out_of_view(camera) for camera in cameras]
+    assert all(0 < each.sum() < len(each) for each in hidden)
+    group = scene.model.geom_group.copy()
+    scene._is_out_of_view = lambda camera: np.zeros(scene.model.ngeom, bool)
+    whole = fast.reset(seed=3)[0]["pixels"]
+    for camera in CAMERAS:
+        np.testing.assert_array_equal(whole[camera], images["fast"][camera])
+    np.testing.assert_array_equal(scene.model.geom_group, group)
+    fast.step(ACTIONS[0])
+    result = fast.episode_result()
+    assert result.render_preset == "fast"
+    assert "--env.render_preset=fast" in LiberoResult.eval_flags([result])
+    for env in made.values():
+        env.close()
+
+
+def make_drawn(preset: str) -> Any:
+    module = importlib.import_module("lerobot_env_bomb_libero.env")
+    scene = {"observation_height": IMAGE_SIZE, "observation_width": IMAGE_SIZE, "render_preset": preset}
+    return module.BombLiberoEnv(LiberoSpec(0, SUITE, max_steps=1), scene)

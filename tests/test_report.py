@@ -189,6 +189,10 @@ def test_every_command_has_the_same_p_value_for_the_same_pairs(
     path = tmp_path / "all.jsonl"
     path.write_text("".join(json.dumps(row) + "\n" for row in [*rows, *others]))
     assert main(["report", str(path), f"--output={tmp_path / 'r.html'}"]) == 0
+    answers, _, paths = capsys.readouterr().out.partition("\n\n")
+    statements = json.loads((tmp_path / "r.json").read_text())[0]["statements"]
+    assert answers.splitlines() == statements and len(statements) > 2
+    assert paths.splitlines() == [str(tmp_path / f"r.{suffix}") for suffix in ("html", "json", "csv")]
     assert main(["results", str(path), "--verbose"]) == 0
     said = capsys.readouterr().out
     # 2 / 2^6 of one pair of conditions of two

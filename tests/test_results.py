@@ -159,7 +159,8 @@ def test_a_file_of_something_else_is_told_from_an_unfinished_one(
 ) -> None:
     path.write_text('{"type": "act"}\nnonsense\n')
     assert main(["results", str(path)]) == 1
-    assert "is no results file; name one that --env.results_path" in capsys.readouterr().err
+    (error,) = capsys.readouterr().err.splitlines()
+    assert "is no results file; name one that --env.results_path" in error
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -79,6 +79,7 @@ def test_several_files_are_one_table_and_a_policy_has_one_name_in_it(path: Path,
         (row(0) + row(0, policy=FDVLA), row(1), False),  # compare takes one policy from each of two files
         (row(0), row(0, policy=FDVLA, image_size=64), False),
         (row(0), row(1), False),
+        (row(0), rows({"camera:3": "+"}, policy=FDVLA), False),  # the other condition: no pair
     ],
 )
 def test_a_comparison_is_named_where_there_is_one(

@@ -17,6 +17,7 @@ from lerobot_bomb.report.report import Report, Sample, sample_failures
 from lerobot_bomb.report.sections import build
 from lerobot_bomb.report.title import title_of
 from lerobot_bomb.results.groups import groups_of
+from lerobot_bomb.tables import print_lines
 
 DEFAULT = Path("report.html")
 NUM_SAMPLES = 3  # of each class of failure, at least
@@ -36,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write FILE.html, FILE.json and FILE.csv, and videos; print their paths."""
+    """Write FILE.html, FILE.json and FILE.csv, and videos; print the answers and their paths."""
     check_at_least(args, films=0, videos=0)
     output = args.output / DEFAULT if args.output.is_dir() else args.output
     if output.suffix not in ("", ".html"):
@@ -63,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
         html.write_text(render(args.title or title_of(report), sections))
         as_json.write_text(json.dumps([section.as_json() for section in sections], indent=1) + "\n")
         as_csv.write_text(_csv(report))
+    print_lines(*map(str, sections[0].statements), "")  # those of the answer
     print(page, tables, rates, *([folder] if folder.is_dir() and args.videos else []), sep="\n")
     return 0
 

@@ -11,7 +11,7 @@ from lerobot_bomb.commands.results_failures import print_failures
 from lerobot_bomb.commands.results_files import FileGroups, ResultsFile, read_undamaged
 from lerobot_bomb.commands.table import PROGRAM
 from lerobot_bomb.report.panels import Series
-from lerobot_bomb.results.comparison import can_compare
+from lerobot_bomb.results.comparison import have_pairs
 from lerobot_bomb.results.groups import (
     POLICY,
     Group,
@@ -149,12 +149,12 @@ def _print_details(told: FileGroups) -> None:
 
 
 def _are_two_to_compare(told: list[FileGroups]) -> bool:
-    """Return True for two policies, in one file or in a file each, if groups differ in nothing else."""
+    """Return True for two policies with episodes in common, in one file or in a file each."""
     policies = [{group.settings[POLICY] for group in each.groups} for each in told]
     if len(set().union(*policies)) != 2 or [len(each) for each in policies] not in ([2], [1, 1]):
         return False
     groups = [group for each in told for group in each.groups]
-    return any(a.policy != b.policy and can_compare(a, b) for a, b in combinations(groups, 2))
+    return any(a.policy != b.policy and have_pairs(a, b) for a, b in combinations(groups, 2))
 
 
 def _next_steps(told: list[FileGroups]) -> Mapping[str, str]:

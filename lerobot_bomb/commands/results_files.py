@@ -110,11 +110,11 @@ def read_undamaged(path: Path) -> ResultsFile:
         ValueError: there is no such file, or no record in it.
     """
     numbered, damages = read_records(path)
+    check_any(path, numbered, damages)
     for damage in damages[:MAX_SHOWN_DAMAGES]:
         print(f"{damage}; not counted", file=sys.stderr)
     if len(damages) > MAX_SHOWN_DAMAGES:
         print(f"{path}: ... and {len(damages) - MAX_SHOWN_DAMAGES} more such lines", file=sys.stderr)
-    check_any(path, numbered, damages)
     records = [*numbered.values()]
     missing = missing_of_sweep(path, len(records)) or missing_of_evaluations(path, records)
     if missing:

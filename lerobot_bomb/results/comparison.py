@@ -36,7 +36,8 @@ class Comparisons:
         number, num_better = len(self.conditions), sum(signs)
         parts = [f"B is better under {num_better}"] if num_better else []
         parts += [f"A is better under {len(signs) - num_better}"] if num_better < len(signs) else []
-        parts += [f"no significant difference under {number - len(signs)}"] if len(signs) < number else []
+        number_left = number - len(signs) if signs else "any"
+        parts += [f"no significant difference under {number_left}"] if len(signs) < number else []
         lines = [f"{each.condition}: {describe_verdict(each)}" for each in self.conditions]
         return [f"of {number} conditions: {', '.join(parts)}", *(f"  {line}" for line in lines)]
 
@@ -92,6 +93,12 @@ def _lines(compared: PairedComparison) -> list[str]:
         f"B alone in {counts.only_second} of {counts.n} pairs, {format_p(compared.p_value)}",
         *([f"           {change}"] if change else []),
     ]
+
+
+def have_pairs(first: Group, second: Group) -> bool:
+    """Return True if two groups differ in nothing but policy and have an episode in common."""
+    keys = [{episode_key(record, None) for record in group.records} for group in (first, second)]
+    return can_compare(first, second) and not keys[0].isdisjoint(keys[1])
 
 
 def can_compare(first: Group, second: Group, across: Collection[str] = ()) -> bool:

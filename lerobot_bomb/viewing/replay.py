@@ -1,5 +1,6 @@
 """Replay of a record's episode, by the policy that ran it then."""
 
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -72,10 +73,15 @@ class Replay:
         }
         env = env_type(record.env_type)
         if not env.view_at:
-            flags = " ".join(record.eval_flags([record]))
+            policy = record.policy
+            flags = [] if policy is None else [f"--policy.path={policy.path}"]
+            if policy is not None and not policy.path:
+                flags = [f"--policy.type={policy.type}"]
+            flags += [*record.eval_flags([record]), f"--seed={record.spec.seed}"]
+            flags += ["--eval.n_episodes=1", "--eval.batch_size=1", "--eval.use_async_envs=false"]
             raise ValueError(
-                f"--env.type={record.env_type} has no recording for Rerun; lerobot-eval runs the "
-                f"episode: {flags} --seed={record.spec.seed} --eval.n_episodes=1 --eval.batch_size=1"
+                f"--env.type={record.env_type} has no recording for Rerun; for a video of the episode: "
+                f"{shlex.join(['lerobot-eval', *flags])}"
             )
         spec: Any = record.spec
         viewed: Viewed = env.view.of_record(record, replace(spec, **changed), self.depth)
