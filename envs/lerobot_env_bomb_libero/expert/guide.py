@@ -79,7 +79,7 @@ class Guide:
         except NoPlanError as error:
             if error.failure != LiberoFailure.NO_GRASP:
                 raise
-            yield from drag(motion, goal, body, places[0])
+            yield from drag(motion, goal, body, places)
         else:
             yield from motion.take(grasp, arm.scene.geoms_of([body]).tolist())
             yield from carry(motion, goal, body, places, grasp)

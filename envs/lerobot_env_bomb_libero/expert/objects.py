@@ -34,6 +34,7 @@ TURNS_RAD = np.radians([0, 30, -30, 60, -60, 90, -90, 135, -135, 180]).tolist() 
 LIFT_M = 0.05
 ABOVE_M = 0.003  # a place, on arrival there
 LOWER_M = 0.001  # a step, until the goal holds
+STEP_M = 0.005  # of height, over which an object is not drawn if there is another way
 LEVEL_M = 0.015  # between the heights of an object and of a place to which it can be dragged
 PRESS_M = 0.012  # how far a drag aims below the object's surface
 AHEAD_M = 0.03  # how far it aims ahead
@@ -119,14 +120,17 @@ def carry(
     yield from motion.let_go()
 
 
-def drag(motion: Motion, goal: Sequence[str], body: int, place: Pose) -> Iterator[NextPose]:
-    """Press on an object from above, and draw it along what it lies on.
+def drag(motion: Motion, goal: Sequence[str], body: int, places: Sequence[Pose]) -> Iterator[NextPose]:
+    """Press on an object from above, and draw it along what it lies on to the first of the most level places.
 
     Raises:
         NoPlanError: the place is at another height, or the gripper is not free at both ends.
         LostError: the object does not come along.
     """
     arm = motion.arm
+    arm.mirror()
+    here_m = arm.body(body).xyz[2]
+    place = min(places, key=lambda each: round(abs(each.xyz[2] - here_m) / STEP_M))
     touch = _touching(motion, body, place)
     yield from motion.go_along(touch.shifted(BACK_M * UP), None, CLOSE)
     pressed = touch.shifted(-PRESS_M * UP)
