@@ -157,9 +157,9 @@ def test_a_folder_is_no_results_file(tmp_path: Path) -> None:
 def test_a_file_of_something_else_is_told_from_an_unfinished_one(
     path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path.write_text('{"type": "act"}\nnonsense\n')
+    path.write_text('{"type": "act"}\nnonsense\n' * 20)
     assert main(["results", str(path)]) == 1
-    (error,) = capsys.readouterr().err.splitlines()
+    _, error = capsys.readouterr().err.splitlines()
     assert "is no results file; name one that --env.results_path" in error
 
 

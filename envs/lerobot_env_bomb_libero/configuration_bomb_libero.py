@@ -30,7 +30,7 @@ class BombLiberoEnvConfig(EvaluatedEnv, LiberoEnv):
 
     # a suite, or several: libero_spatial,libero_goal
     task: str = SUITES[0]
-    # stock: LIBERO's images; fast: without multisampling, reflections and shadows, in a quarter of the time
+    # stock: LIBERO's images; fast: without multisampling, reflections and shadows, in a third of the time
     render_preset: str = RENDER_PRESETS[0]
 
     def _check(self) -> None:

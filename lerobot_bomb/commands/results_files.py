@@ -110,9 +110,9 @@ def read_undamaged(path: Path) -> ResultsFile:
         ValueError: there is no such file, or no record in it.
     """
     numbered, damages = read_records(path)
-    check_any(path, numbered, damages)
-    for damage in damages[:MAX_SHOWN_DAMAGES]:
+    for damage in damages[: MAX_SHOWN_DAMAGES if numbered else 1]:  # of another file, one line says enough
         print(f"{damage}; not counted", file=sys.stderr)
+    check_any(path, numbered, damages)
     if len(damages) > MAX_SHOWN_DAMAGES:
         print(f"{path}: ... and {len(damages) - MAX_SHOWN_DAMAGES} more such lines", file=sys.stderr)
     records = [*numbered.values()]

@@ -1,5 +1,6 @@
 """Replay of a record's episode, by the policy that ran it then."""
 
+import json
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -78,6 +79,7 @@ class Replay:
             if policy is not None and not policy.path:
                 flags = [f"--policy.type={policy.type}"]
             flags += [*record.eval_flags([record]), f"--seed={record.spec.seed}"]
+            flags += [f"--env.perturbations={json.dumps([record.spec.perturbations])}"]
             flags += ["--eval.n_episodes=1", "--eval.batch_size=1", "--eval.use_async_envs=false"]
             raise ValueError(
                 f"--env.type={record.env_type} has no recording for Rerun; for a video of the episode: "

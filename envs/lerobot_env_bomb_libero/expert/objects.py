@@ -34,7 +34,7 @@ TURNS_RAD = np.radians([0, 30, -30, 60, -60, 90, -90, 135, -135, 180]).tolist() 
 LIFT_M = 0.05
 ABOVE_M = 0.003  # a place, on arrival there
 LOWER_M = 0.001  # a step, until the goal holds
-STEP_M = 0.005  # of height, over which an object is not drawn if there is another way
+HEIGHT_STEP_M = 0.005  # of height, over which an object is not drawn if there is another way
 LEVEL_M = 0.015  # between the heights of an object and of a place to which it can be dragged
 PRESS_M = 0.012  # how far a drag aims below the object's surface
 AHEAD_M = 0.03  # how far it aims ahead
@@ -130,7 +130,7 @@ def drag(motion: Motion, goal: Sequence[str], body: int, places: Sequence[Pose])
     arm = motion.arm
     arm.mirror()
     here_m = arm.body(body).xyz[2]
-    place = min(places, key=lambda each: round(abs(each.xyz[2] - here_m) / STEP_M))
+    place = min(places, key=lambda each: round(abs(each.xyz[2] - here_m) / HEIGHT_STEP_M))
     touch = _touching(motion, body, place)
     yield from motion.go_along(touch.shifted(BACK_M * UP), None, CLOSE)
     pressed = touch.shifted(-PRESS_M * UP)
