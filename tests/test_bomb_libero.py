@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 from pathlib import Path
 
 import pytest
@@ -128,6 +129,29 @@ def test_groups_of_results_name_suite_and_condition() -> None:
 def test_without_assets_the_folder_and_the_way_out_are_named(libero: Libero) -> None:
     with pytest.raises(ValueError, match=r"assets are missing.*hf download lerobot/libero-assets"):
         BombLiberoEnvConfig(task_ids=[0]).create_envs(1)
+
+
+def test_a_sweep_without_libero_ends_before_it_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(Libero, "find", lambda: None)
+    sweep = ["sweep", str(tmp_path / "s"), "--policies=bomb_expert", "--env.type=bomb_libero"]
+    assert main(sweep) == 1
+    assert "LIBERO is not installed: pip install" in capsys.readouterr().err
+    assert not (tmp_path / "s").exists()
+    assert main([*sweep, "--dry_run"]) == 0  # of jobs for another machine
+
+
+def test_replay_names_the_command_that_films_the_episode(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "lines.jsonl"
+    path.write_text(line(7, "light:3", False, task_id=2))
+    assert main(["replay", str(path), "--line=1", f"--output={tmp_path / 'out'}"]) == 1
+    said = capsys.readouterr().err
+    flags = shlex.split(said[said.index("lerobot-eval") :])[1:]
+    assert {"--env.type=bomb_libero", "--env.task_ids=[2]", "--seed=7"} < {*flags}
+    assert '--env.perturbations=["light:3"]' in flags
 
 
 def line(seed: int, condition: str, is_success: bool, task_id: int = 0) -> str:

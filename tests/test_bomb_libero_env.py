@@ -55,11 +55,11 @@ COMPARED = (
 ACTIONS = np.array([[0.5, -0.3, -0.6, 0.1, 0, 0.2, -1], [0.2, 0.4, -0.9, 0, 0.1, 0, -1]] * 3, np.float32)
 
 
-def make(condition: str, task_id: int = 0, **kwargs: Any) -> Any:
+def make(condition: str, task_id: int = 0, render_preset: str = "stock", **kwargs: Any) -> Any:
     module = importlib.import_module("lerobot_env_bomb_libero.env")
     max_steps = kwargs.pop("max_steps", None)
     size = {"observation_height": IMAGE_SIZE, "observation_width": IMAGE_SIZE}
-    scene = size | {"obs_type": "pixels_agent_pos"}
+    scene = size | {"obs_type": "pixels_agent_pos", "render_preset": render_preset}
     return module.BombLiberoEnv(LiberoSpec(0, SUITE, task_id, max_steps, condition), scene, **kwargs)
 
 
@@ -358,7 +358,7 @@ def test_sync_and_async_workers_see_the_same_bits(libero_with_assets: Libero) ->
 @pytest.mark.long
 def test_the_fast_preset_draws_the_same_scene_and_says_so(libero_with_assets: Libero) -> None:
     """Compare with the stock images, and with the fast ones of which nothing out of view is left out."""
-    made = {preset: make_drawn(preset) for preset in ("stock", "fast")}
+    made = {preset: make(NONE, render_preset=preset, max_steps=1) for preset in ("stock", "fast")}
     images = {preset: env.reset(seed=3)[0]["pixels"] for preset, env in made.items()}
     for camera in CAMERAS:
         stock, fast = (images[preset][camera].astype(float) for preset in ("stock", "fast"))
@@ -381,9 +381,3 @@ def test_the_fast_preset_draws_the_same_scene_and_says_so(libero_with_assets: Li
     assert "--env.render_preset=fast" in LiberoResult.eval_flags([result])
     for env in made.values():
         env.close()
-
-
-def make_drawn(preset: str) -> Any:
-    module = importlib.import_module("lerobot_env_bomb_libero.env")
-    scene = {"observation_height": IMAGE_SIZE, "observation_width": IMAGE_SIZE, "render_preset": preset}
-    return module.BombLiberoEnv(LiberoSpec(0, SUITE, max_steps=1), scene)

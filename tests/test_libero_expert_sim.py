@@ -72,7 +72,7 @@ def test_gripper_opens_at_minus_one(recorded: Path) -> None:
     [(7, 1001), (7, 1003), (4, 1002), (4, 1008)],  # the bowl is near the arm's base; in a drawer far from it
 )
 def test_expert_solves_what_it_once_lost(libero_with_assets: Libero, task_id: int, seed: int) -> None:
-    """It let go in a turn that the arm cannot make, or closed the gripper on the drawer's wall."""
+    """Run episodes in which it asked the arm for a turn out of reach, or gripped the drawer's wall."""
     spec = LiberoSpec(seed, "libero_spatial", task_id)
     rollouts = LiberoRollouts(0.0, {"obs_type": "pixels_agent_pos", "observation_height": SIZE})
     env = rollouts.make_env(spec)

@@ -3,14 +3,13 @@
 import argparse
 from dataclasses import fields
 
-from lerobot_bomb.data.libero_recording import LiberoRecording
+from lerobot_bomb.data.libero_recording import IMAGE_SIZE, LiberoRecording
 from lerobot_bomb.libero.episode import RENDER_PRESETS
 from lerobot_bomb.libero.goals import check_goals
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.libero import LiberoResult
 
 BOMB, BOMB_LIBERO = EpisodeResult.env_type, LiberoResult.env_type
-SIZES = ("observation_height", "observation_width")
 RECORDING_FLAGS = {each.name for each in fields(LiberoRecording)} - {"env_type"}
 # arguments that bomb alone has
 BOMB_ONLY = (
@@ -18,7 +17,8 @@ BOMB_ONLY = (
     "depth", "split", "target", "color", "success_tolerance_mm",
 )  # fmt: skip
 # arguments -> flags that are not --NAME
-FLAG_OF = {"policy_path": "policy.path", "env_type": "env.type", **{name: f"env.{name}" for name in SIZES}}
+FLAG_OF = {"policy_path": "policy.path", "env_type": "env.type"}
+FLAG_OF |= {name: f"env.{name}" for name in IMAGE_SIZE}
 
 
 def add_env_type_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,7 +32,7 @@ def add_env_type_arguments(parser: argparse.ArgumentParser) -> None:
         "--env.task_ids (default: all), --env.perturbations, the size of its images and "
         f"--env.render_preset ({', '.join(RENDER_PRESETS)}; default: {LiberoRecording.render_preset})",
     )
-    for name in SIZES:
+    for name in IMAGE_SIZE:
         default = getattr(LiberoRecording, name)
         help = f"of bomb_libero's images, in pixels (default: {default})"
         parser.add_argument(f"--env.{name}", dest=name, type=int, help=help)
@@ -50,7 +50,8 @@ def libero_recording(args: argparse.Namespace) -> LiberoRecording:
             flag = FLAG_OF.get(name, name)
             raise ValueError(f"--{flag} is of --env.type={BOMB}; leave it out with --env.type={BOMB_LIBERO}")
     given = {name: value for name, value in vars(args).items() if name in RECORDING_FLAGS}
-    left_out = {name for name in (*SIZES, "render_preset", "task") if given[name] == args.default_of(name)}
+    own_defaults = (*IMAGE_SIZE, "render_preset", "task")
+    left_out = {name for name in own_defaults if given[name] == args.default_of(name)}
     recording = LiberoRecording(**{name: value for name, value in given.items() if name not in left_out})
     check_goals(recording.conditions)
     return recording
@@ -58,6 +59,6 @@ def libero_recording(args: argparse.Namespace) -> LiberoRecording:
 
 def refuse_libero_flags(args: argparse.Namespace) -> None:
     """Raise a ValueError for a flag that bomb does not have."""
-    for name in SIZES:
+    for name in IMAGE_SIZE:
         if (value := getattr(args, name)) is not None:
             raise ValueError(f"--env.{name}={value} is of --env.type={BOMB_LIBERO}; leave it out")

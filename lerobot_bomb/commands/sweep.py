@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     """Run all missing episodes; exit code 1 if some are still missing."""
     _check_numbers(args)
     manifest = _manifest(args)
-    if args.slurm is None and args.submitit is None:  # a cluster's nodes may have what this machine lacks
+    if not (args.dry_run or args.slurm or args.submitit):  # another machine may have what this one lacks
         for name, tasks in {(job.env_type, flag_value(job.env, "--env.task")) for job in manifest.jobs}:
             env_type(name).check(tasks.split(",") if tasks else ())
     with claimed(args.folder, manifest, args.batch_size) as store:

@@ -97,8 +97,10 @@ def _lines(compared: PairedComparison) -> list[str]:
 
 def have_pairs(first: Group, second: Group) -> bool:
     """Return True if two groups differ in nothing but policy and have an episode in common."""
-    keys = [{episode_key(record, None) for record in group.records} for group in (first, second)]
-    return can_compare(first, second) and not keys[0].isdisjoint(keys[1])
+    if not can_compare(first, second):
+        return False
+    keys, others = ({episode_key(record, None) for record in group.records} for group in (first, second))
+    return not keys.isdisjoint(others)
 
 
 def can_compare(first: Group, second: Group, across: Collection[str] = ()) -> bool:

@@ -90,6 +90,11 @@ class PolicyIdentity:
         return " ".join([*words, *([f"({', '.join(notes)})"] if notes else [])])
 
     @property
+    def flag(self) -> str:
+        """Flag of lerobot-eval that names the policy."""
+        return f"--policy.type={self.type}" if self.path is None else f"--policy.path={self.path}"
+
+    @property
     def key(self) -> str:
         """Text that is equal for the same weights with the same settings, wherever they lie."""
         values = (self.type, self.weights_sha256, self.settings_sha256, self.base, self.is_in_training)

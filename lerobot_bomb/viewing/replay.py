@@ -74,12 +74,10 @@ class Replay:
         }
         env = env_type(record.env_type)
         if not env.view_at:
-            policy = record.policy
-            flags = [] if policy is None else [f"--policy.path={policy.path}"]
-            if policy is not None and not policy.path:
-                flags = [f"--policy.type={policy.type}"]
+            flags = [] if record.policy is None else [record.policy.flag]
             flags += [*record.eval_flags([record]), f"--seed={record.spec.seed}"]
-            flags += [f"--env.perturbations={json.dumps([record.spec.perturbations])}"]
+            condition = json.dumps([record.spec.perturbations])
+            flags += [f"--env.perturbations={condition}"] if record.condition.axes else []
             flags += ["--eval.n_episodes=1", "--eval.batch_size=1", "--eval.use_async_envs=false"]
             raise ValueError(
                 f"--env.type={record.env_type} has no recording for Rerun; for a video of the episode: "

@@ -127,13 +127,15 @@ class Motion:
                 raise LostError
             yield target
 
-    def is_free(self, grasp: Grasp, geoms: np.ndarray) -> bool:
-        """Return True if the open gripper comes straight to a grasp, and closes on these geoms only."""
+    def is_free(self, grasp: Grasp, is_grasped: np.ndarray) -> bool:
+        """Return True if the open gripper comes straight to a grasp, and closes on nothing else.
+
+        `is_grasped`: (geoms,) bool, what the fingers close on.
+        """
         way = [grasp.pose.shifted(-back_m * grasp.approach) for back_m in (BACK_M, BACK_M / 2, 0.0)]
         if not is_free_way(self.arm, way, None, OPEN_M, KEPT_M):
             return False
-        is_grasped = np.isin(np.arange(self.arm.model.ngeom), geoms)
-        for opening_m in CLOSING_M:
+        for opening_m in CLOSING_M:  # at the last pose of the way
             self.arm.set_fingers(opening_m)
             if self.arm.clearance_m(ignored=is_grasped) < KEPT_M:
                 return False

@@ -52,12 +52,12 @@ def choose_grasp(motion: Motion, body: int, places: Sequence[Pose]) -> Grasp:
     arm.mirror()
     surface = surface_of(arm.model, arm.data, arm.scene.geoms_of([body]))
     lowest_m = surface.points[:, 2].min() + LOWEST_M
-    thing, is_any_free, fitting = arm.body(body), False, []
+    thing, mine, is_any_free, fitting = arm.body(body), arm.geoms([body]), False, []
     for approaches in ([DOWN], tilted(TILTS_RAD)):
         count = MAX_POINTS // len(approaches) + 40
         grasps = grasps_of(surface, motion.grip, approaches, lowest_m, count=count)
         for grasp in grasps[:MAX_TRIED]:
-            if not motion.is_free(grasp, arm.scene.geoms_of([body])):
+            if not motion.is_free(grasp, mine):
                 continue
             is_any_free = True
             if _leads_to_place(motion, Held(body, grasp.pose.inverse @ thing), grasp.pose, places):

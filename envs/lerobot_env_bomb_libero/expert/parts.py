@@ -116,14 +116,15 @@ def _choose_grasp(motion: Motion, part: MovingPart) -> Grasp:
     start, now = arm.body(part.body), part.position(arm.model, arm.data)
     positions = [now + share * (part.target - now) for share in SHARES]
     poses = [part.pose_at(arm, position) for position in positions]
+    mine = np.isin(np.arange(arm.model.ngeom), part.geoms)
     grasps = grasps_of(
         surface, motion.grip, [DOWN, *tilted(TILTS_RAD)],
         offsets=(0.0,), rolls=ROLLS_RAD, count=MAX_POINTS,
     )  # fmt: skip
     for grasp in grasps:
         in_part = start.inverse @ grasp.pose
-        if motion.is_free(grasp, part.geoms) and all(
-            _can_hold(arm, part, position, pose @ in_part)
+        if motion.is_free(grasp, mine) and all(
+            _can_hold(arm, part, mine, position, pose @ in_part)
             for position, pose in zip(positions, poses, strict=True)
         ):
             fitting.append(grasp)
@@ -134,16 +135,15 @@ def _choose_grasp(motion: Motion, part: MovingPart) -> Grasp:
     raise NoPlanError(LiberoFailure.NO_GRASP)
 
 
-def _can_hold(arm: Arm, part: MovingPart, position: float, pose: Pose) -> bool:
-    """Return True if the arm is free at a pose, while the part is at a position."""
+def _can_hold(arm: Arm, part: MovingPart, mine: np.ndarray, position: float, pose: Pose) -> bool:
+    """Return True if the arm touches only the part's own geoms at a pose, while the part is at a position."""
     arm.mirror()
     joints = arm.joints
     part.pose_at(arm, position)
     if not arm.reach(pose, joints, arm.rest):
         return False
     arm.set_fingers(CLOSED_M)
-    ignored = np.isin(np.arange(arm.model.ngeom), part.geoms)
-    return arm.clearance_m(ignored=ignored) >= KEPT_M
+    return arm.clearance_m(ignored=mine) >= KEPT_M
 
 
 def _move(motion: Motion, part: MovingPart) -> Iterator[NextPose]:

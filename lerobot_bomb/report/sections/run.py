@@ -19,18 +19,12 @@ def commands(group: Group) -> list[str]:
     """Describe the evaluations, and the flags that repeat them."""
     by, first = by_condition(group.records), group.records[0]
     seeds = {each.spec.seed for each in group.records}
-    flags = [_policy_flag(first), *first.eval_flags(group.records)]
+    flags = ["--policy.type=TYPE" if first.policy is None else first.policy.flag]
+    flags += [*first.eval_flags(group.records)]
     flags += [f"--env.perturbations={json.dumps(list(by))}"] if first.condition.axes else []
     flags += _as_evaluated(first)
     flags += [f"--seed={min(seeds)}", f"--eval.n_episodes={max(map(len, by.values()))}"]
     return [*(f"  {line}" for line in group.lines()), f"  {shlex.join(['lerobot-eval', *flags])}"]
-
-
-def _policy_flag(record: Record) -> str:
-    policy = record.policy
-    if policy is None or policy.path is None:
-        return f"--policy.type={'TYPE' if policy is None else policy.type}"
-    return f"--policy.path={policy.path}"
 
 
 def _as_evaluated(record: Record) -> list[str]:
