@@ -67,6 +67,15 @@ def test_every_env_type_of_lerobots_can_be_swept(tmp_path: Path, capsys: pytest.
     assert "--env.type=aloha --env.task=AlohaInsertion-v0 --seed=1000" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("flags", "size"), [((), 1), (("--batch_size=4",), 4)])
+def test_an_environment_chooses_its_batches(
+    flags: tuple[str, ...], size: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    env = ("--env.type=bomb_libero", "--tasks=libero_spatial", "--episodes=8", "--dry_run")
+    assert sweep(tmp_path, "--policies=bomb_expert", *env, *flags) == 0
+    assert f"--eval.batch_size={size} " in capsys.readouterr().out
+
+
 def test_a_manifest_is_read_as_it_was_written(tmp_path: Path) -> None:
     manifest = small(("bomb:fdvla", "bomb_random"), ("none", "all:1-5"))
     manifest.write(tmp_path)

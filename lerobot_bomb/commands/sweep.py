@@ -29,7 +29,6 @@ from lerobot_bomb.sweep.manifest import NAME, Job, Manifest, plan, policy_flag
 from lerobot_bomb.sweep.store import RESULTS, Store
 from lerobot_bomb.tables import print_lines
 
-MAX_BATCH = 10
 SCRIPT = "sweep.sbatch"
 ALL = "0/1"  # the only part
 
@@ -52,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_env_flag(parser, "perturbations", type=parse_conditions, default=(), help=conditions)
     add("--episodes", type=int, default=20, help="of each task and condition (default: 20)")
     add("--seed", type=int, default=TEST_SEEDS[0], help=f"the first one (default: {TEST_SEEDS[0]})")
-    add("--batch_size", type=int, default=MAX_BATCH, help=f"at most (default: {MAX_BATCH})")
+    add("--batch_size", type=int, help=f"at most (default: {Record.sweep_batch}; LIBERO: 1)")
     add("--workers", type=int, default=1, help="processes, each on a GPU in turn (default: 1)")
     add_job_arguments(parser, "jobs", f"FOLDER/{SCRIPT}")
     add("--timeout", type=int, help="seconds that a job may take (default: no limit)")
@@ -122,10 +121,9 @@ def interrupted_by_sigterm() -> Iterator[None]:
 
 
 def _check_numbers(args: argparse.Namespace) -> None:
-    check_at_least(args, episodes=1, batch_size=1, seed=0, workers=1)
+    check_at_least(args, episodes=1, seed=0, workers=1)
     shard_of(args)
-    if args.timeout is not None:
-        check_at_least(args, timeout=1)
+    check_at_least(args, **{name: 1 for name in ("batch_size", "timeout") if getattr(args, name) is not None})
     if args.seed + args.episodes - 1 > MAX_SEED:
         raise ValueError(f"--seed={args.seed} and --episodes={args.episodes}: the last seed is {MAX_SEED}")
 
@@ -157,7 +155,7 @@ def _manifest(args: argparse.Namespace) -> Manifest:
     for task in args.tasks if record_type.tasks else ():
         one_of("--env.task", task, record_type.tasks)
     conditions = _expanded(args.perturbations, record_type)
-    args.batch_size = 1 if record_type.starts_by_number else args.batch_size
+    args.batch_size = 1 if record_type.starts_by_number else args.batch_size or record_type.sweep_batch
     return plan(args.policies, args.tasks, conditions, args.seed, args.episodes, args.batch_size, args.rest)
 
 

@@ -66,6 +66,7 @@ class LiberoResult(Record):
     tasks: ClassVar = SUITES
     failures: ClassVar = LiberoFailure
     suite_sizes: ClassVar = TASKS_PER_SUITE
+    sweep_batch: ClassVar = 1  # starting a simulator takes longer than a batch saves
 
     spec: LiberoSpec
     instruction: str  # text that the policy read

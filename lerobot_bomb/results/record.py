@@ -88,6 +88,7 @@ class Record(ABC):
     has_results_path: ClassVar[bool] = True  # lerobot-eval writes the records, with --env.results_path
     # an episode's number in its evaluation, not its seed, chooses how it starts: in batches of one
     starts_by_number: ClassVar[bool] = False
+    sweep_batch: ClassVar[int] = 10  # largest batch of `sweep`, unless --batch_size is given
 
     spec: Spec
     is_success: bool  # the episode succeeded
