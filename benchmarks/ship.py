@@ -1,6 +1,6 @@
-"""Put a policy that benchmarks/learn.py trained into the package, where `--policy.path=bomb:TYPE` finds it.
+"""Put a policy that benchmarks/learn.py trained into the package, where `--policy.path=bomb:NAME` finds it.
 
-    python benchmarks/ship.py FOLDER
+    python benchmarks/ship.py FOLDER [--name=TYPE_suites]
 
 The weights are the training's own, bit for bit; the configs lose the paths of the machine.
 """
@@ -22,9 +22,10 @@ def main() -> None:
     """Copy the last checkpoint in place of the one that is there; print its hash and size."""
     parser = make_parser(__doc__)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="--output_dir of learn.py")
+    parser.add_argument("--name", help="after `bomb:` (default: the policy's type)")
     args = parser.parse_args()
     checkpoint = last_checkpoint(args.folder / "train")
-    target = FOLDER / read_json(checkpoint / CONFIG)["type"]
+    target = FOLDER / (args.name or read_json(checkpoint / CONFIG)["type"])
     shutil.rmtree(target, ignore_errors=True)
     shutil.copytree(checkpoint, target)
     for name in (CONFIG, TRAIN_CONFIG):

@@ -121,6 +121,7 @@ def test_seeds_of_the_training_are_found(arms: dict[str, Records]) -> None:
     [
         (["--episodes=1"], "--episodes=1 must be at least 2"),
         (["--eval.n_episodes=3"], "--eval.n_episodes is set for every job"),
+        (["--env.task=long"], "--env.task=long has episodes whose instruction changes"),
     ],
 )
 def test_wrong_flags_are_told(

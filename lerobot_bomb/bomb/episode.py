@@ -46,8 +46,9 @@ class Failure(FailureClass):
     MISSED_GRASP = "missed_grasp", "the stone never lifted"
     DROPPED = (
         "dropped",
-        f"let go more than {1e3 * DROP_HEIGHT_M:g} mm above its resting height, or at rest more than "
-        f"{1e3 * OFF_BOARD_M:g} mm from every intersection; or let go elsewhere as time ran out",
+        f"the stone let go more than {1e3 * DROP_HEIGHT_M:g} mm above its resting height; or at rest more "
+        f"than {1e3 * OFF_BOARD_M:g} mm from every intersection; or lifted earlier but, when time ran out, "
+        "neither held nor on the target",
     )
     WRONG_STONE = "wrong_stone", "another stone carried"
     WRONG_INTERSECTION = "wrong_intersection", "put down nearest to another intersection"
@@ -58,9 +59,10 @@ class Failure(FailureClass):
     )
     TIMEOUT_HOLDING = (
         "timeout_holding",
-        "time out with the stone between or at the pads, or on the target but not yet at rest",
+        "time running out while the stone was between the pads or touched them, or lay on the target but not "
+        "yet at rest",
     )
-    LIFTED = "lifted", "a stone lifted instead of pushed"
+    LIFTED = "lifted", "a stone lifted that was to be pushed (only in `goal`)"
 
 
 def check_seed(seed: int) -> None:

@@ -50,8 +50,10 @@ _OWN = {
         "where the gripper and the stone to be moved are at the start",
         ("images", "state"),
         {
-            "stone": Magnitude("mm", (16, 32, 48, 64, 82), "of the stone along the tray, to a drawn side"),
-            "gripper": Magnitude("mm", (16, 32, 48, 64, 82), "of the gripper, in a drawn direction"),
+            "stone": Magnitude(
+                "mm", (16, 32, 48, 64, 82), "shift of the stones in the tray, to a drawn side"
+            ),
+            "gripper": Magnitude("mm", (16, 32, 48, 64, 82), "shift of the gripper, in a drawn direction"),
         },
         "lerobot_env_bomb.axes.start:Start",
     ),
@@ -98,8 +100,8 @@ _OWN = {
         "mass and friction of the stones, noise and latency of the arm",
         ("dynamics",),
         {
-            "mass": Magnitude("factor", (1.15, 1.3, 1.5, 1.75, 2.0), "multiplies or divides"),
-            "friction": Magnitude("factor", (1.05, 1.1, 1.2, 1.3, 1.4), "divides or multiplies"),
+            "mass": Magnitude("factor", (1.15, 1.3, 1.5, 1.75, 2.0), "multiplies or divides the mass"),
+            "friction": Magnitude("factor", (1.05, 1.1, 1.2, 1.3, 1.4), "multiplies or divides the friction"),
             "noise": Magnitude(
                 "40 mm",
                 (0.01, 0.02, 0.03, 0.04, 0.05),

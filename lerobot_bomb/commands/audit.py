@@ -10,6 +10,7 @@ from lerobot_bomb.bomb.episode import TEST_SEEDS
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE
 from lerobot_bomb.checkpoints.training import dataset_of, read_train_config, trained_image_size
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO, check_at_least, checkpoint_flag, path_flag
+from lerobot_bomb.conditions import ALL
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.flags import flag_value
 from lerobot_bomb.report import verdicts
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from lerobot.processor import ProcessorStep
 
 MAX_BATCH = 10
+TURN_BY_TURN = ("long", ALL)  # an instruction that changes in an episode cannot be exchanged
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -59,7 +61,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run all groups, write the page, print the verdicts; exit code 3 if one is no."""
     check_at_least(args, episodes=2, seed=0, workers=1)
-    check_flags(args.rest)
+    task = flag_value(args.rest, "--env.task")
+    if task in TURN_BY_TURN:
+        raise ValueError(f"--env.task={task} has episodes whose instruction changes; audit another suite")
+    check_flags([flag for flag in args.rest if not flag.startswith("--env.task=")])
     groups = _run_jobs(args, args.folder / "first", _first_groups(args))
     groups |= _run_jobs(args, args.folder / "second", _second_groups(args, groups[POLICY]))
     found = judge(groups, _trained_seeds(args.policy_path))

@@ -99,7 +99,7 @@ Checkpoints
     $
     $ --socket=policy.socket
 Installation
-  demo: evaluate a shipped policy beside expert and random actions
+  demo: evaluate a shipped policy on three suites, see a failure and a success
     $
     $ --episodes=2 --output_dir=outputs/demo
   doctor: check this installation

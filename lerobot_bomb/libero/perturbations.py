@@ -76,8 +76,8 @@ _OWN = {
         "mass and friction of the objects, noise and latency of the arm",
         ("dynamics",),
         {
-            "mass": Magnitude("factor", (1.2, 1.4, 1.7, 2.0, 2.5), "multiplies or divides"),
-            "friction": Magnitude("factor", (1.1, 1.2, 1.35, 1.5, 1.7), "divides or multiplies"),
+            "mass": Magnitude("factor", (1.2, 1.4, 1.7, 2.0, 2.5), "multiplies or divides the mass"),
+            "friction": Magnitude("factor", (1.1, 1.2, 1.35, 1.5, 1.7), "multiplies or divides the friction"),
             "noise": Magnitude(
                 "share", (0.02, 0.04, 0.06, 0.08, 0.1), "of the range, standard deviation on executed motion"
             ),

@@ -36,8 +36,8 @@ lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/galle
 - A **range** such as `camera:1-5` draws the level from the seed. Each axis of `all:1-5` draws its own
   level.
 - `{ALL}:3` is one condition: every axis at level 3, except `goal_marker`, which makes the task easier.
-- `{EACH}:3` stands for ten conditions, each of these axes alone at level 3; `{EACH}:1-5` for fifty.
-  Only lists of conditions take it.
+- `{EACH}:3` stands for ten conditions, each of these axes alone at level 3; `{EACH}:1-5` for fifty, each
+  axis alone at each level. It works only where a list of conditions is allowed, so not in `view`.
 
 Each condition is a group in `eval_info.json`, such as `place.camera-2.light-3` or `place.all-1to5`.
 Everything needed stays in view, and the instruction stays unambiguous.
