@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -241,6 +242,16 @@ def test_without_drawing_states_are_the_same_and_films_are_drawn(
     np.testing.assert_array_equal(flat(shown["robot_state"]), flat(black["robot_state"]))
     assert film.any()
     assert (film != same_film).mean() < 0.05  # a simulator step apart
+
+
+def test_a_region_of_the_table_is_no_object(libero: Libero) -> None:
+    from lerobot_env_bomb_libero.scene import LiberoScene
+
+    sites = {"main_table_stove_front_region": SimpleNamespace(parent_name=None)}
+    env = SimpleNamespace(object_sites_dict=sites, obj_of_interest=["plate_1", *sites])
+    scene: Any = SimpleNamespace(_built=SimpleNamespace(env=env))
+    wanted: Any = LiberoScene.wanted
+    assert wanted.func(scene) == {"plate_1"}
 
 
 def test_what_the_gripper_touches_is_told_by_name(env: Any) -> None:

@@ -17,7 +17,7 @@ from lerobot_bomb.checkpoints.shipped import FOLDER
 from lerobot_bomb.hub.card import Checkpoint
 
 ROOT = Path(__file__).parents[1]
-COLUMN = "which of its paper's methods it uses"
+COLUMN = "which of its paper's methods it uses, and which not"
 SUITES = "fdvla_suites"
 
 

@@ -133,7 +133,8 @@ class LiberoScene(LiberoEnv):
         """Objects and fixtures that the task is about."""
         sites = self._built.env.object_sites_dict
         names = self._built.env.obj_of_interest
-        return {sites[name].parent_name if name in sites else name for name in names}
+        owners = (sites[name].parent_name if name in sites else name for name in names)
+        return {name for name in owners if name is not None}  # a region of the table has no owner
 
     @cached_property
     def owners(self) -> np.ndarray:
