@@ -20,7 +20,7 @@ POLICY_TYPES = {name.removeprefix(POLICY_PREFIX) for name in PACKAGES if name.st
 NAMES_POLICIES = {
     "checkpoints/spatialvla_folder.py": {"spatialvla_grid"},  # whose format it writes
     "commands/audit.py": {"bomb_expert", "bomb_random"},  # ceiling and floor
-    "commands/demo.py": {"vla0_smol", "bomb_expert", "bomb_random"},  # policies that act
+    "commands/demo.py": {"bomb_expert"},  # ceiling of the demo's table
     "commands/table.py": {"vla0_smol", "fdvla", "bomb_expert"},  # examples of commands
 }
 HEAVY = {"torch", "lerobot", "transformers", "rerun", "cv2"}
@@ -30,7 +30,7 @@ CORE = "lerobot_bomb"
 # a folder or module of the core imports from those above it in this list
 ORDER = [
     "__init__", "registry", "compat", "finite", "flag_errors", "flags", "conditions", "failures",
-    "environments", "stats", "bootstrap", "smoothness", "tables", "files", "cuda_graphs",
+    "environments", "stats", "bootstrap", "smoothness", "tables", "files", "presets", "cuda_graphs",
     "bomb", "pusht", "libero", "results", "envs", "actions", "flow", "vlm", "decoding", "training", "data",
     "checkpoints", "evaluation", "viewing", "explain", "report", "hub", "policies", "serving", "harness",
     "sweep", "commands",

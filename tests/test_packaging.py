@@ -11,6 +11,7 @@ import yaml
 
 from lerobot_bomb import __version__
 from lerobot_bomb.commands.doctor import DISTRIBUTION
+from lerobot_bomb.presets import preset_names
 
 ROOT = Path(__file__).parents[1]
 SOURCE_ROOTS = [ROOT, ROOT / "envs", ROOT / "policies"]
@@ -55,6 +56,7 @@ def test_the_wheel_holds_every_module_the_scene_and_the_checkpoints(wheel: Path)
         )
         for path in root.glob(pattern)
     }
+    expected |= {f"lerobot_bomb/configs/{name}.yaml" for name in preset_names()}
     assert packed == expected
     assert "lerobot_env_bomb/scene.xml" in packed
     assert {f"{name.split('/')[0]}/py.typed" for name in packed} <= packed  # every package is typed

@@ -99,6 +99,9 @@ Checkpoints
     $
     $ --socket=policy.socket
 Installation
+  config: list the presets of lerobot-train and lerobot-eval; print or copy one
+    $
+    $ train_fdvla_bomb --output=train_fdvla_bomb.yaml
   demo: evaluate a shipped policy on three suites, see a failure and a success
     $
     $ --episodes=2 --output_dir=outputs/demo

@@ -166,7 +166,7 @@ def joint_loss(
 
 @contextmanager
 def second_derivatives(enabled: bool) -> Iterator[None]:
-    """If enabled, use attention that can be differentiated twice, unlike its fused kernels."""
+    """Use attention that, unlike its fused kernels, can be differentiated twice, if enabled."""
     if not enabled:
         yield
         return

@@ -20,6 +20,7 @@ EXPERT = "--policy.type=bomb_expert --env.type=bomb --env.task=place --env.image
 COMMANDS = (
     ("lerobot-bomb --version", "lerobot-bomb {version}"),
     ("lerobot-bomb doctor", "everything works"),
+    ("lerobot-bomb config train_fdvla_bomb", "type: fdvla"),
     ("python -m lerobot.scripts.lerobot_train --policy.type=vla0_smol --help", "--policy.vlm_model_name"),
     (
         f"python -m lerobot.scripts.lerobot_eval {EXPERT} --eval.n_episodes=1 --eval.batch_size=1",
