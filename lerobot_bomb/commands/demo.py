@@ -3,7 +3,6 @@
 import argparse
 import os
 import time
-from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
@@ -66,33 +65,32 @@ def run(args: argparse.Namespace) -> int:
         for line, record in read_undamaged(results).numbered.items()
         if record.policy is not None and record.policy.type != "bomb_expert"
     }
-    _say(2, "Replay a failure: which perturbation causes it?")
-    replayed = [_replay(output_dir, "failure", records, lambda record: not record.is_success)]
-    _say(3, "Replay a perturbed success")
-    replayed.append(_replay(output_dir, "success", records, lambda record: record.is_success))
+    _say(2, "Replay a failure")
+    failed = _replay(output_dir, "failure", {line: each for line, each in records.items() if each.failure})
+    _say(3, "Replay a success")
+    _replay(output_dir, "success", {line: each for line, each in records.items() if each.is_success})
     _say(4, "Write a page with every rate and failure")
     run_command("lerobot-bomb", "report", str(results), f"--output={report}")
     _say(5, "Print the rates")
     run_command("lerobot-bomb", "results", str(results))
     print(f"\n{CLOSING.format(policy=POLICY)}")
-    print(f"films   {', '.join(replayed)}")
+    print(f"films   {output_dir}/*.mp4, and .rrd for Rerun")
+    if failed:
+        print(f"why     lerobot-bomb explain --results={results} --line={failed}")
     print(f"report  {report}")
     print(f"Done in {(time.monotonic() - started) / 60:.1f} minutes")
     return 0
 
 
-def _replay(folder: Path, name: str, records: dict[int, Record], is_shown: Callable[[Record], bool]) -> str:
-    """Replay the last such episode, perturbed if one is; return its video's path, "none" without one."""
-    found = [line for line, record in records.items() if is_shown(record)]
-    perturbed = [line for line in found if records[line].spec.perturbations != NONE]
-    if not found:
+def _replay(folder: Path, name: str, records: dict[int, Record]) -> int | None:
+    """Replay the last of the episodes, a perturbed one if there is; return its line, None without any."""
+    lines = [line for line, record in records.items() if record.spec.perturbations != NONE] or [*records]
+    if not lines:
         print(f"There is no {name}.")
-        return "none"
-    line = (perturbed or found)[-1]
-    run_command(
-        "lerobot-bomb", "replay", str(folder / RESULTS), f"--line={line}", f"--output={folder / name}"
-    )
-    return f"{folder / name}.mp4"
+        return None
+    results, output = folder / RESULTS, folder / name
+    run_command("lerobot-bomb", "replay", str(results), f"--line={lines[-1]}", f"--output={output}")
+    return lines[-1]
 
 
 def _say(step: int, text: str) -> None:

@@ -50,10 +50,3 @@ class VideoFile:
         if self._stream is not None:
             self._file.mux(self._stream.encode())
         self._file.close()
-
-
-def last_frame(path: Path) -> np.ndarray:
-    """Return a video's last image, (H, W, 3) uint8."""
-    with av.open(str(path)) as file:
-        *_, frame = file.decode(video=0)
-    return frame.to_ndarray(format="rgb24")
