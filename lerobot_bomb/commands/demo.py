@@ -20,6 +20,7 @@ POLICY = "fdvla_suites"
 SUITES = ("place", "spatial", "goal")
 CONDITIONS = (NONE, "all:3")
 SEED = TEST_SEEDS[0]  # no demonstration had it
+IMAGE_SIZE = 64  # pixels, as the policy was trained with; so the expert's episodes pair with the policy's
 MAX_WORKERS = 2
 CLOSING = """\
 bomb:{policy} is a small model, trained from scratch on one CPU core; docs/results.md says what it can do.
@@ -59,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
         f"--seed={SEED}",
         f"--workers={min(MAX_WORKERS, os.cpu_count() or 1)}",
         "--policy.device=cpu",
+        f"--env.image_size={IMAGE_SIZE}",
     )
     records = {
         line: record
