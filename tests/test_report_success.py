@@ -108,6 +108,20 @@ def test_other_settings_are_panels_of_their_own(report: Callable[..., dict[str, 
     assert section["lines"] == [] and "image_size 64" in section["statements"][1]
 
 
+@pytest.mark.parametrize("version", ["1.0", "1.1"])
+def test_the_version_of_a_task_is_said_where_the_suite_has_several(
+    version: str, report: Callable[..., dict[str, Any]]
+) -> None:
+    place = values(0)
+    other = place["spec"] | {"suite": "object"}
+    rows = [
+        place,
+        *(place | {"spec": other, "task_id": 0, "task_version": each} for each in {version, "1.1"}),
+    ]
+    said = " ".join(report(rows)["Success"]["statements"])
+    assert ("task_version 1.1" in said) == (version == "1.0")
+
+
 def test_the_numbers_say_of_what_the_measures_are(report: Callable[..., dict[str, Any]]) -> None:
     section = report([values(0)])["Success"]
     assert "placement error" in summary(section)[0]["measures"]

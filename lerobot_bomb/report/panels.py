@@ -12,6 +12,7 @@ from lerobot_bomb.results.record import Record
 from lerobot_bomb.stats import Rate
 
 MAX_CONDITIONS = 24  # that a chart can show below each other
+TASK_VERSION = "task_version"
 MAX_SETTING = 24  # characters of a setting in the name of a panel
 
 
@@ -147,7 +148,10 @@ def panels_of(groups: Sequence[Group]) -> list[Panel]:
 
 def _panel_names(groups: list[Group]) -> list[str]:
     """Name panels by their suites, and by short settings that differ between them."""
-    several = [name for name in differing(groups) if name not in (POLICY, "suite")]
+    versions = {(each.settings.get("suite"), each.settings.get(TASK_VERSION)) for each in groups}
+    one_each = len(versions) == len({suite for suite, _ in versions})  # then the suite's name says it
+    told = (POLICY, "suite", *([TASK_VERSION] if one_each else []))
+    several = [name for name in differing(groups) if name not in told]
     types = {each.record_type.env_type for each in groups}
     names = []
     for group in groups:
