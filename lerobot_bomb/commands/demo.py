@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         if record.policy is not None and record.policy.type != "bomb_expert"
     }
     _say(2, "Replay a failure")
-    failed = _replay(output_dir, "failure", {line: each for line, each in records.items() if each.failure})
+    _replay(output_dir, "failure", {line: each for line, each in records.items() if each.failure})
     _say(3, "Replay a success")
     _replay(output_dir, "success", {line: each for line, each in records.items() if each.is_success})
     _say(4, "Write a page with every rate and failure")
@@ -77,22 +77,19 @@ def run(args: argparse.Namespace) -> int:
     run_command("lerobot-bomb", "results", str(results))
     print(f"\n{CLOSING.format(policy=POLICY)}")
     print(f"films   {output_dir}/*.mp4, and .rrd for Rerun")
-    if failed:
-        print(f"why     lerobot-bomb explain --results={results} --line={failed}")
     print(f"report  {report}")
     print(f"Done in {(time.monotonic() - started) / 60:.1f} minutes")
     return 0
 
 
-def _replay(folder: Path, name: str, records: dict[int, Record]) -> int | None:
-    """Replay the last of the episodes, a perturbed one if there is; return its line, None without any."""
+def _replay(folder: Path, name: str, records: dict[int, Record]) -> None:
+    """Replay the last of the episodes, a perturbed one if there is, to FOLDER/NAME.mp4 and .rrd."""
     lines = [line for line, record in records.items() if record.spec.perturbations != NONE] or [*records]
     if not lines:
         print(f"There is no {name}.")
-        return None
+        return
     results, output = folder / RESULTS, folder / name
     run_command("lerobot-bomb", "replay", str(results), f"--line={lines[-1]}", f"--output={output}")
-    return lines[-1]
 
 
 def _say(step: int, text: str) -> None:
