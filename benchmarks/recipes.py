@@ -5,7 +5,8 @@ from typing import Any
 
 import yaml
 
-FOLDER = Path(__file__).parents[1] / "configs"
+from lerobot_bomb.presets import FOLDER
+
 # every policy type that learns comes with such a file; every proof runs on all of them
 POLICY_TYPES = sorted(path.stem.removeprefix("overfit_") for path in FOLDER.glob("overfit_*.yaml"))
 

@@ -71,6 +71,13 @@ def check_writable(flag: str, path: Path) -> None:
         raise ValueError(f"{flag}={path} cannot be written; give a file in a folder that exists")
 
 
+def check_new_file(flag: str, path: Path) -> None:
+    """Raise a ValueError unless a file can be made at the path that a flag gives, where there is none."""
+    if path.exists():
+        raise ValueError(f"{flag}={path} exists already; name a new file")
+    check_writable(flag, path)
+
+
 def check_new_folder(flag: str, path: Path) -> None:
     """Raise a ValueError if there is something at the path that a flag gives."""
     check_link(flag, path)

@@ -3,10 +3,11 @@
 from pathlib import Path
 
 import pytest
-from recipes import FOLDER
 
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.presets import preset_names
+
+FOLDER = Path(__file__).parents[1] / "configs"
 
 
 def test_every_config_file_is_a_preset(capsys: pytest.CaptureFixture[str]) -> None:

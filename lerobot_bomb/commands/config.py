@@ -4,6 +4,7 @@ import argparse
 import shutil
 
 from lerobot_bomb.commands.arguments import path_flag
+from lerobot_bomb.files import check_new_file
 from lerobot_bomb.presets import SUFFIX, preset_names, preset_path
 
 
@@ -24,9 +25,8 @@ def run(args: argparse.Namespace) -> int:
     if args.output is None:
         print(path.read_text(), end="")
         return 0
-    if args.output.exists():
-        raise ValueError(f"--output={args.output} exists")
     args.output.parent.mkdir(parents=True, exist_ok=True)
+    check_new_file("--output", args.output)
     shutil.copyfile(path, args.output)
     print(args.output)
     return 0

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
-from lerobot_bomb.results.groups import Group, groups_of, settings_of
+from lerobot_bomb.results.groups import PER_TASK, Group, groups_of, settings_of
 from lerobot_bomb.results.names import policy_key, policy_names
 from lerobot_bomb.results.reading import check_any, read_records
 from lerobot_bomb.results.record import Record, Spec, describe_numbers
@@ -15,7 +15,6 @@ from lerobot_bomb.sweep.manifest import NAME, Manifest
 from lerobot_bomb.sweep.store import ERRORS, RESULTS
 
 MAX_SHOWN_DAMAGES = 10
-PER_TASK = ("suite", "task_version")  # settings in which the tasks of one evaluation may differ
 
 
 def check_outputs(inputs: Sequence[Path], outputs: Iterable[Path]) -> None:

@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, replace
 
 from lerobot_bomb.commands.arguments import add_dataset_arguments, path_flag
-from lerobot_bomb.files import check_writable, written_whole
+from lerobot_bomb.files import check_new_file, written_whole
 
 LEGEND = """
 Mean length of second (J2) and third (J3) differences {per}; in the dataset's units, and normalised by the
@@ -70,8 +70,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_flags(args: argparse.Namespace) -> None:
     if args.json is not None:
-        if args.json.exists():
-            raise ValueError(f"--json={args.json} exists already; name a new file")
-        check_writable("--json", args.json)
+        check_new_file("--json", args.json)
     if args.fps is not None and not 0 < args.fps < math.inf:
         raise ValueError(f"--fps={args.fps:g} must be a positive number of actions a second")

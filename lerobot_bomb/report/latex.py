@@ -8,6 +8,7 @@ from lerobot_bomb.report.cells import INTERVALS
 from lerobot_bomb.report.panels import Panel, Series, panels_of
 from lerobot_bomb.results.comparison import Comparisons, compare
 from lerobot_bomb.results.groups import (
+    PER_TASK,
     POLICY,
     Group,
     Policy,
@@ -31,7 +32,7 @@ NEEDS = "% needs \\usepackage{booktabs}\n"
 NOTHING = "--"  # in a cell
 MAX_BESIDE = 3  # policies in columns of their own; more stand below each other
 SMALLEST_P = 0.001
-STATED = (POLICY, "suite", "task_version")  # settings that every table says
+STATED = (POLICY, *PER_TASK)  # settings that every table says
 
 type Wins = set[tuple[str, str, str]]  # the first group's name, which is better than the second's
 

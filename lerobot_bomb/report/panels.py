@@ -6,13 +6,12 @@ from functools import cached_property
 
 from lerobot_bomb.conditions import NONE, AxisCondition
 from lerobot_bomb.results.comparison import can_compare
-from lerobot_bomb.results.groups import POLICY, Group, by_condition, differing, rate_of
+from lerobot_bomb.results.groups import PER_TASK, POLICY, Group, by_condition, differing, rate_of
 from lerobot_bomb.results.pairs import PairedComparison, compare_pairs, pair_with_nominal
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.stats import Rate
 
 MAX_CONDITIONS = 24  # that a chart can show below each other
-TASK_VERSION = "task_version"
 MAX_SETTING = 24  # characters of a setting in the name of a panel
 
 
@@ -148,9 +147,9 @@ def panels_of(groups: Sequence[Group]) -> list[Panel]:
 
 def _panel_names(groups: list[Group]) -> list[str]:
     """Name panels by their suites, and by short settings that differ between them."""
-    versions = {(each.settings.get("suite"), each.settings.get(TASK_VERSION)) for each in groups}
-    one_each = len(versions) == len({suite for suite, _ in versions})  # then the suite's name says it
-    told = (POLICY, "suite", *([TASK_VERSION] if one_each else []))
+    tasks = {tuple(map(each.settings.get, PER_TASK)) for each in groups}
+    is_told = len(tasks) == len({suite for suite, _ in tasks})  # a suite of one version: its name says it
+    told = (POLICY, *(PER_TASK if is_told else PER_TASK[:1]))
     several = [name for name in differing(groups) if name not in told]
     types = {each.record_type.env_type for each in groups}
     names = []

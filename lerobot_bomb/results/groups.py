@@ -13,6 +13,7 @@ from lerobot_bomb.results.record import Record, describe_numbers
 from lerobot_bomb.stats import Rate
 
 POLICY = "policy"  # the one setting that the episodes of two policies may differ in
+PER_TASK = ("suite", "task_version")  # settings in which the tasks of one evaluation may differ
 # fields of a spec in which a group's episodes may differ: pooled ones in seed, paired ones in perturbations
 DRAWN = ("seed", "perturbations")
 # fields that a group lists, but that keep no episodes apart

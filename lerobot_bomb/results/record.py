@@ -189,6 +189,11 @@ class Record(ABC):
         """Name the benchmark with its version, for a model card."""
 
     @classmethod
+    def condition_flags(cls, conditions: Iterable[str]) -> list[str]:
+        """Return lerobot-eval's flag of these conditions; [] in an environment that has none."""
+        return [f"--env.perturbations={json.dumps([*conditions])}"] if cls.condition.axes else []
+
+    @classmethod
     @abstractmethod
     def eval_flags(cls, records: Sequence[Self]) -> list[str]:
         """Return lerobot-eval's flags for the environment and tasks of episodes."""

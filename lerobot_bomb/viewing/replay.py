@@ -1,6 +1,5 @@
 """Replay of a record's episode, by the policy that ran it then."""
 
-import json
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -75,10 +74,9 @@ class Replay:
         env = env_type(record.env_type)
         if not env.view_at:
             flags = [] if record.policy is None else [record.policy.flag]
-            flags += [*record.eval_flags([record]), f"--seed={record.spec.seed}"]
-            condition = json.dumps([record.spec.perturbations])
-            flags += [f"--env.perturbations={condition}"] if record.condition.axes else []
-            flags += ["--eval.n_episodes=1", "--eval.batch_size=1", "--eval.use_async_envs=false"]
+            flags += [*record.eval_flags([record]), *record.condition_flags([record.spec.perturbations])]
+            flags += [f"--seed={record.spec.seed}", "--eval.n_episodes=1", "--eval.batch_size=1"]
+            flags += ["--eval.use_async_envs=false"]
             raise ValueError(
                 f"--env.type={record.env_type} has no recording for Rerun; for a video of the episode: "
                 f"{shlex.join(['lerobot-eval', *flags])}"

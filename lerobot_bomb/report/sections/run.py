@@ -1,6 +1,5 @@
 """Section `run`: the evaluations, and the flags that repeat them."""
 
-import json
 import shlex
 
 from lerobot_bomb.report.report import Report
@@ -20,9 +19,7 @@ def commands(group: Group) -> list[str]:
     by, first = by_condition(group.records), group.records[0]
     seeds = {each.spec.seed for each in group.records}
     flags = ["--policy.type=TYPE" if first.policy is None else first.policy.flag]
-    flags += [*first.eval_flags(group.records)]
-    flags += [f"--env.perturbations={json.dumps(list(by))}"] if first.condition.axes else []
-    flags += _as_evaluated(first)
+    flags += [*first.eval_flags(group.records), *first.condition_flags(by), *_as_evaluated(first)]
     flags += [f"--seed={min(seeds)}", f"--eval.n_episodes={max(map(len, by.values()))}"]
     return [*(f"  {line}" for line in group.lines()), f"  {shlex.join(['lerobot-eval', *flags])}"]
 
