@@ -92,9 +92,10 @@ Checkpoints
     $ --policy.path=bomb:vla0_smol --dataset.repo_id=me/bomb --dataset.root=data/bomb --val_episodes=0-9
     $ --policy.path=outputs/act --dataset.repo_id=me/bomb --dataset.root=data/bomb --val_episodes=[0,1]
       --json=outputs/metrics.json
-  push: publish a checkpoint or a recorded dataset on the Hub, with a card
+  push: publish a checkpoint, a recorded dataset or an environment on the Hub, with a card
     $ outputs/train/checkpoints/last/pretrained_model --repo_id=me/policy --results results.jsonl
     $ data/bomb --repo_id=me/bomb --dry_run
+    $ --env.type=bomb --env.task=goal --repo_id=me/goal
   serve: run LeRobot's policy server, for a robot on another machine
     $
     $ --socket=policy.socket

@@ -30,7 +30,7 @@ class LiberoFailure(FailureClass):
     NO_GRASP = "no_grasp", "the expert's planner found no free grasp"
     NO_PLACE = (
         "no_place",
-        "the expert's planner found no free place that the goal accepts and a grasp leads to",
+        "the expert's planner found no free place that the goal accepts and a grasp can reach",
     )
     NO_PATH = "no_path", "the expert's planner found no free path of the gripper"
 

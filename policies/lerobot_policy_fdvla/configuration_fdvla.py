@@ -213,8 +213,8 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
             )
 
     def methods(self) -> list[str]:
-        heads = {"flow": self.use_flow_head, "noise": self.use_denoise_head}
-        modulated = {"flow": self.dualmod_flow, "noise": self.dualmod_denoise}
+        heads = {"flow": self.use_flow_head, "diffusion": self.use_denoise_head}
+        modulated = {"flow": self.dualmod_flow, "diffusion": self.dualmod_denoise}
         used = [name for name, is_used in heads.items() if is_used]
         of_used = [f"{name} head" for name in used if modulated[name]]
         of_heads = "both" if len(of_used) > 1 else (of_used or ["none"])[0]
