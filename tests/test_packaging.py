@@ -1,3 +1,4 @@
+import os
 import re
 import subprocess
 import sys
@@ -17,9 +18,10 @@ ROOT = Path(__file__).parents[1]
 SOURCE_ROOTS = [ROOT, ROOT / "envs", ROOT / "policies"]
 
 
-def build(target: str, source: Path, folder: Path) -> Path:
+def build(target: str, source: Path, folder: Path, repository: str = "") -> Path:
     command = [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(folder)]
-    subprocess.run(command, cwd=source, check=True, capture_output=True)
+    environment = {**os.environ, "REPOSITORY": repository}
+    subprocess.run(command, cwd=source, env=environment, check=True, capture_output=True)
     (built,) = folder.iterdir()
     return built
 
@@ -84,6 +86,29 @@ def test_the_sdist_holds_what_is_under_version_control_without_images(unpacked: 
         "constraints.txt",
         "configs/eval_bomb_place.yaml",
     } <= packed
+
+
+def metadata(wheel: Path) -> str:
+    (text,) = (content for name, content in files(wheel).items() if name.endswith("/METADATA"))
+    return text.decode()
+
+
+def test_a_package_index_shows_the_readme(wheel: Path, tmp_path: Path) -> None:
+    readme = (ROOT / "README.md").read_text()
+    assert metadata(wheel).endswith(readme)
+    published = metadata(build("wheel", ROOT, tmp_path, repository="https://example.org/me/bomb/"))
+    start = f"https://example.org/me/bomb/{{}}/v{__version__}/"
+    targets = re.findall(r"\]\(([^)]+)\)", published)
+    assert len(targets) == len(re.findall(r"\]\(([^)]+)\)", readme)) > 20
+    assert [each for each in targets if not each.startswith("https://")] == []
+    assert start.format("raw") + "docs/media/episode.gif" in targets
+    assert start.format("blob") + "docs/benchmark.md#seeds" in targets
+    assert "Project-URL: Repository, https://example.org/me/bomb\n" in published
+
+
+def test_all_is_all_extras(wheel: Path) -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert extras.pop("all") == [f"lerobot_policy_bomb[{','.join(extras)}]"]
 
 
 def test_versions_agree(wheel: Path) -> None:

@@ -63,6 +63,8 @@ def main() -> None:
     run([sys.executable, "-m", "hatchling", "build", "-d", DIST], ROOT)
     (wheel,) = DIST.glob("*.whl")
     (sdist,) = DIST.glob("*.tar.gz")
+    run([sys.executable, "-m", "twine", "check", "--strict", wheel, sdist], ROOT)
+    print("ok  twine check --strict", flush=True)
     version = sdist.name.removeprefix(f"{OURS}-").removesuffix(".tar.gz")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -77,6 +79,8 @@ def main() -> None:
                 sys.exit(f"{command}: its output lacks {wanted.format(version=version)!r}")
             print(f"ok  {command}", flush=True)
     print(f"{wheel.relative_to(ROOT)} and {sdist.name} can be published")
+    if not os.environ.get("REPOSITORY"):
+        print("but README's links are relative: make build REPOSITORY=URL makes them lead to a repository")
 
 
 if __name__ == "__main__":
