@@ -66,6 +66,9 @@ Evaluate and diagnose
   explain: find what a policy's actions depend on: patches, objects, words, layers, heads
     $ --policy.path=bomb:fdvla --step=3
     $ --results=results.jsonl --line=26 --output=outputs/why
+  app: show policies in a browser: run, perturb, compare, explain
+    $
+    $ --policy.path=outputs/train/checkpoints/last/pretrained_model --port=8000
 Checkpoints
   checkpoint path: print the folders of the shipped checkpoints
     $
