@@ -15,7 +15,7 @@ from lerobot_bomb.commands.table import COMMANDS, RENAMED, overview
 GROUPS = {
     "Datasets and episodes": ["record", "convert", "view"],
     "Results": ["results", "compare", "report", "export"],
-    "Evaluate and diagnose": ["sweep", "replay", "audit", "explain"],
+    "Evaluate and diagnose": ["sweep", "replay", "audit", "explain", "app"],
     "Checkpoints": ["checkpoint", "push", "serve"],
     "Installation": ["config", "demo", "doctor"],
 }

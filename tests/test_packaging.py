@@ -20,7 +20,7 @@ SOURCE_ROOTS = [ROOT, ROOT / "envs", ROOT / "policies"]
 
 def build(target: str, source: Path, folder: Path, repository: str = "") -> Path:
     command = [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(folder)]
-    environment = {**os.environ, "REPOSITORY": repository}
+    environment = {**os.environ, "REPOSITORY": repository, "PYTHONDONTWRITEBYTECODE": "1"}
     subprocess.run(command, cwd=source, env=environment, check=True, capture_output=True)
     (built,) = folder.iterdir()
     return built

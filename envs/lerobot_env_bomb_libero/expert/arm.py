@@ -1,7 +1,8 @@
 # pyright: reportAttributeAccessIssue=false
 """The arm in a copy of the scene: posed by inverse kinematics, and asked how near it is to things."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
 
@@ -22,7 +23,7 @@ DAMPING = 0.02
 MAX_TURN_RAD = 0.25  # of a joint in an iteration
 REACHED = (0.002, 0.02)  # metres and radians
 LIMIT_RAD = 0.05  # that joints keep from their limits
-ELBOW, BENT_RAD = 3, 0.8  # a joint, and what it keeps from straight: near there the arm leaves its way
+ELBOW, BENT_RAD = 3, 0.95  # a joint, and what it keeps from straight: near there the arm leaves its way
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,15 @@ class Arm:
     def joints(self) -> np.ndarray:
         """(7,) radians."""
         return self.data.qpos[self._qpos].copy()
+
+    @contextmanager
+    def keeping_bent(self, bent_rad: float) -> Iterator[None]:
+        """Let the elbow keep this from straight, in radians."""
+        usual, self._high[ELBOW] = self._high[ELBOW], -bent_rad
+        try:
+            yield
+        finally:
+            self._high[ELBOW] = usual
 
     def reach(self, pose: Pose, *starts: np.ndarray) -> bool:
         """Bring the gripper to a pose, from one of these joints on; False if it cannot be reached."""

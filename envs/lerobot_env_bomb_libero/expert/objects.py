@@ -1,12 +1,13 @@
 """Objects that are put somewhere: taken, carried and let go, or dragged if they cannot be grasped."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 
 import numpy as np
 
 from lerobot_bomb.libero.episode import LiberoFailure
 from lerobot_bomb.libero.expert import CLOSE
-from lerobot_env_bomb_libero.expert.arm import CLOSED_M, Held, Pose
+from lerobot_env_bomb_libero.expert.arm import BENT_RAD, CLOSED_M, Held, Pose
 from lerobot_env_bomb_libero.expert.grasps import FINGER_M, MAX_POINTS, Grasp, grasps_of
 from lerobot_env_bomb_libero.expert.motion import (
     ARRIVED,
@@ -31,6 +32,8 @@ TILTS_RAD = np.radians([25, 45]).tolist()  # of an approach, if none from above 
 MAX_TRIED = 400  # grasps
 LOWEST_M = 0.0115  # of the point between the pads above what an object stands on
 TURNS_RAD = np.radians([0, 30, -30, 60, -60, 90, -90, 135, -135, 180]).tolist()  # of an object in its place
+# least bends of the elbow, the first that will do: a stretched arm is pushed past straight, and stays there
+BENDS_RAD = (1.2, BENT_RAD)
 LIFT_M = 0.05
 ABOVE_M = 0.003  # a place, on arrival there
 LOWER_M = 0.001  # a step, until the goal holds
@@ -48,6 +51,16 @@ def choose_grasp(motion: Motion, body: int, places: Sequence[Pose]) -> Grasp:
     Raises:
         NoPlanError: there is none.
     """
+    first = motion.losses % len(BENDS_RAD)
+    *bends_rad, last_rad = (*BENDS_RAD[first:], *BENDS_RAD[:first])
+    for bent_rad in bends_rad:
+        with motion.arm.keeping_bent(bent_rad), suppress(NoPlanError):
+            return _choose_grasp(motion, body, places)
+    with motion.arm.keeping_bent(last_rad):
+        return _choose_grasp(motion, body, places)
+
+
+def _choose_grasp(motion: Motion, body: int, places: Sequence[Pose]) -> Grasp:
     arm = motion.arm
     arm.mirror()
     surface = surface_of(arm.model, arm.data, arm.scene.geoms_of([body]))
@@ -107,8 +120,12 @@ def carry(
     arm.mirror()
     as_grasped = grasp.pose.mat.T @ places[0].mat
     held = Held(body, Pose((motion.grip.inverse @ arm.body(body)).xyz, as_grasped))
-    pose = _gripper_at(motion, held, places)
-    if pose is None:
+    for bent_rad in BENDS_RAD:
+        with arm.keeping_bent(bent_rad):
+            pose = _gripper_at(motion, held, places)
+        if pose is not None:
+            break
+    else:
         raise NoPlanError(LiberoFailure.NO_PLACE)
     yield from motion.while_held(motion.go_along(pose.shifted(BACK_M * UP), held, CLOSE), geoms)
     yield from motion.go(pose, CLOSE, ARRIVED, 0.5)
