@@ -98,9 +98,11 @@ def test_both_episodes_are_those_of_view(
     with pytest.raises(RuntimeError, match="the simulator's process ended"):
         commands.view(Choice("expert", "place", 3))
     assert commands.view(Choice("expert", "place", 3)).file.exists()
+    with Commands(tmp_path) as again:  # in the folder of an earlier run
+        assert again.view(Choice("expert", "place", 3)).file.exists()
 
 
-def test_the_page_runs_and_says_what_is_wrong(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_page_runs_and_says_what_is_wrong(commands: Commands) -> None:
     from gradio_client import Client
 
     blocks = app_page(commands, "expert")

@@ -1,4 +1,7 @@
-"""Explanations beside the tools that others use: captum's occlusion, nnsight's interventions."""
+"""Explanations beside the tools that others use: captum's occlusion, nnsight's interventions.
+
+Neither knows prompts or flow policies, so the package itself uses none of them.
+"""
 
 import json
 import os

@@ -1,4 +1,7 @@
-"""Two processes train what one does on their batches together; layers that FSDP shards one by one."""
+"""Two processes train what one does on their batches together; layers that FSDP shards one by one.
+
+FSDP is not resumed here: on CPUs torch mixes up the optimiser states that it gathers.
+"""
 
 from collections.abc import Callable
 from functools import cache

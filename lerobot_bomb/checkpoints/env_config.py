@@ -7,8 +7,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import draccus
+from draccus.utils import DecodingError
 from lerobot.envs import EnvConfig
 from lerobot.processor import PolicyProcessorPipeline
+from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.queries import last_query
@@ -16,8 +19,24 @@ from lerobot_bomb.compat.hooks.evaluation import tell_of_evaluations
 from lerobot_bomb.compat.use import use
 from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
 from lerobot_bomb.flag_errors import flag_errors
+from lerobot_bomb.flags import one_of
 from lerobot_bomb.results.record import Spec
 from lerobot_bomb.results.writing import check_results_path
+
+
+def decode_env(flags: Mapping[str, Any]) -> EnvConfig:
+    """Return the config of an environment, given its flags by name: {"type": "bomb", "task": "goal"}.
+
+    Raises:
+        ValueError: the type or a flag is unknown, or has a value that is not allowed.
+    """
+    register_third_party_plugins()
+    one_of("--env.type", flags["type"], sorted(EnvConfig.get_known_choices()))
+    try:
+        return draccus.decode(EnvConfig, dict(flags))
+    except DecodingError as error:
+        raise ValueError(str(error)) from None
+
 
 _EnvConfig = EnvConfig if TYPE_CHECKING else object  # the defaults of a subclass' other base hold
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lerobot_bomb.commands.app_runs import Commands, check_policy_name
 from lerobot_bomb.commands.arguments import path_flag, switch
-from lerobot_bomb.commands.serve import LOOPBACK, MAX_PORT
+from lerobot_bomb.commands.serve import LOOPBACK, check_listening, check_port_number
 from lerobot_bomb.results.names import SHIPPED_PREFIX
 
 DEFAULT_PORT = 7860
@@ -28,15 +28,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C."""
-    if not 1 <= args.port <= MAX_PORT:
-        raise ValueError(f"--port={args.port} must lie in 1..{MAX_PORT}")
-    if args.host != LOOPBACK and not args.allow_network:
-        raise ValueError(
-            f"--host={args.host} may be reached by other machines; add --allow_network to let them"
-        )
+    check_port_number(args.port)
     if find_spec("gradio") is None:
         raise RuntimeError("the app needs gradio: pip install 'lerobot_policy_bomb[app]'")
     check_policy_name(args.first_policy)
+    check_listening(args.host, args.port, args.allow_network)
     with contextlib.ExitStack() as stack:
         folder = args.output or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         folder.mkdir(parents=True, exist_ok=True)

@@ -14,10 +14,10 @@ from lerobot_bomb.bomb.perturbations import AXES
 from lerobot_bomb.bomb.suites import OWN_SUITES
 from lerobot_bomb.checkpoints.shipped import shipped_names
 from lerobot_bomb.commands.app_runs import DRAWN, SUITE_WITH_TARGETS, Choice, Commands
+from lerobot_bomb.conditions import MAX_LEVEL
 from lerobot_bomb.results.names import SHIPPED_PREFIX
 from lerobot_bomb.viewing.episode import EXPERT
 
-MAX_LEVEL = 5
 AXES_IN_A_ROW = 4
 SAME_CLEAN = "the same policy, unperturbed"
 VIDEO_HEIGHT = 300  # in pixels

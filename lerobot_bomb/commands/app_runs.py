@@ -12,6 +12,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import mkdtemp
 
 from lerobot_bomb.bomb.episode import MAX_SEED
 from lerobot_bomb.checkpoints.names import is_hub_id
@@ -93,7 +94,6 @@ class Commands:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._count = 0
         self._pool = self._new_pool()
 
     @staticmethod
@@ -118,8 +118,7 @@ class Commands:
 
     def _run(self, name: str, choice: Choice, ending: str) -> Shown:
         flags = choice.flags()
-        self._count += 1
-        output = self._folder / f"{name}-{self._count}"
+        output = Path(mkdtemp(dir=self._folder)) / name  # the folder may hold files of an earlier run
         try:
             code, text = self._pool.submit(run_here, [name, *flags, f"--output={output}"]).result()
         except BrokenProcessPool:

@@ -47,8 +47,7 @@ def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C; a client names the checkpoint."""
     if args.fps < 1:
         raise ValueError(f"--fps={args.fps} must be at least 1")
-    if not 1 <= args.port <= MAX_PORT:
-        raise ValueError(f"--port={args.port} must lie in 1..{MAX_PORT}")
+    check_port_number(args.port)
     if find_spec("grpc") is None:  # LeRobot's own extra, which few need
         raise RuntimeError("the server needs grpc: pip install 'lerobot_policy_bomb[async]'")
     with _address(args) as address:
@@ -76,7 +75,7 @@ def _address(args: argparse.Namespace) -> Iterator[str]:
         ValueError: the address is in use, or other machines would reach it.
     """
     if args.socket is None:
-        _check_port(args.host, args.port, args.allow_network)
+        check_listening(args.host, args.port, args.allow_network)
         yield f"{args.host}:{args.port}"
         return
     path = args.socket.absolute()
@@ -89,7 +88,13 @@ def _address(args: argparse.Namespace) -> Iterator[str]:
         path.unlink(missing_ok=True)
 
 
-def _check_port(host: str, port: int, allow_network: bool) -> None:
+def check_port_number(port: int) -> None:
+    """Raise a ValueError unless this may be a port."""
+    if not 1 <= port <= MAX_PORT:
+        raise ValueError(f"--port={port} must lie in 1..{MAX_PORT}")
+
+
+def check_listening(host: str, port: int, allow_network: bool) -> None:
     """Raise a ValueError unless the port is free and, without `allow_network`, open to this machine only."""
     try:
         with socket.create_server((host, port)) as listener:

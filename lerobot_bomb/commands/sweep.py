@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
         if args.dry_run:
             print(*(job.command for job in jobs), sep="\n")
             return 0
-        if args.retry:
+        if args.retry:  # now, not when a cluster's job starts: a late one would delete what another finished
             store.begin_again(jobs)
         if args.slurm is not None:
             write_job_array(_part_command(args), args.slurm, args.folder / SCRIPT)

@@ -63,7 +63,13 @@ def convert_libero(
         one_of("--image_convention", image_convention, tuple(CONVENTIONS))
     source = LiberoHdf5(path, image_convention, skip_noops)
     conversion = LiberoConversion(
-        repo_id, f"{LIBERO_SOURCE} {source.sha256}", source.suite, images, skip_noops, image_convention
+        # by content: a moved folder can be resumed, a changed one not
+        repo_id,
+        f"{LIBERO_SOURCE} {source.sha256}",
+        source.suite,
+        images,
+        skip_noops,
+        image_convention,
     )
     check_folders(conversion, root, unfinished_folder(root, conversion.kind), resume)
     source.check()

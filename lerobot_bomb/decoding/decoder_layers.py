@@ -88,7 +88,10 @@ class TextLayers:
 
     @torch.no_grad()
     def refresh(self) -> None:
-        """Update the copy, if any, to the model's current weights."""
+        """Update the copy, if any, to the model's current weights, which may change between two answers.
+
+        A CUDA graph reads fixed addresses, so they are copied for every answer: 2.5 ms for a 500M model.
+        """
         copies = [copied for copied, _, _ in self._copied]
         weights = [getattr(module, name) for _, module, name in self._copied]
         torch._foreach_copy_(copies, weights)  # pyright: ignore[reportPrivateImportUsage]

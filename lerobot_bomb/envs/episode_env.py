@@ -61,6 +61,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, n
         """
         seed = None if seed is None else _whole(seed)
         super().reset(seed=seed)
+        # without a seed not the spec's: a batch shares a spec, and would run one episode
         self._seed = int(self.np_random.integers(2**31)) if seed is None else seed
         self._steps = 0
         self._last_transition = None

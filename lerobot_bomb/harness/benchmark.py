@@ -4,18 +4,15 @@ import json
 from dataclasses import asdict
 from typing import Any
 
-import draccus
 import gymnasium
 import numpy as np
-from draccus.utils import DecodingError
-from lerobot.envs import EnvConfig
-from lerobot.utils.import_utils import register_third_party_plugins
 from vla_eval.benchmarks.base import StepBenchmark, StepResult
 from vla_eval.specs import IMAGE_RGB, LANGUAGE, DimSpec
 from vla_eval.types import Action, EpisodeResult, Observation, Task
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS, EpisodeSpec
 from lerobot_bomb.bomb.observation import ACTION_DIM, ACTION_NAMES, AGENT_POS, CAMERAS, PIXELS, STATE_DIM
+from lerobot_bomb.checkpoints.env_config import decode_env
 from lerobot_bomb.envs.rollout import ENV_ID
 from lerobot_bomb.results.writing import check_results_path
 
@@ -109,8 +106,4 @@ def _env_config(flags: dict[str, Any]) -> Any:
     """Read the config of ``--env.type=bomb`` with LeRobot's parser."""
     if flags.get("depth"):
         raise ValueError("depth: true: an observation of the harness has no depth; use lerobot-eval")
-    register_third_party_plugins()
-    try:
-        return draccus.decode(EnvConfig, {"type": "bomb", **flags})
-    except DecodingError as error:
-        raise ValueError(str(error)) from None
+    return decode_env({"type": "bomb", **flags})

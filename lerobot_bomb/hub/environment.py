@@ -1,6 +1,5 @@
 """Publishing of an environment on the Hub, as the file `env.py` from which LeRobot's `make_env` builds it."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pprint import pformat
@@ -10,7 +9,6 @@ import yaml
 from huggingface_hub import CommitInfo, HfApi, ModelCardData
 
 from lerobot_bomb.environments import env_type
-from lerobot_bomb.flags import one_of
 from lerobot_bomb.hub.markdown import command, fenced
 from lerobot_bomb.hub.push import CARD
 from lerobot_bomb.hub.upload import check_token, hub_errors, upload
@@ -67,10 +65,8 @@ class PublishedEnvironment:
                 "        observation, info = environment.reset(seed=1000)",
             )
         )
-        texts = {
-            name: value if isinstance(value, str) else json.dumps(value) for name, value in self.flags.items()
-        }
-        given = [f"{PREFIX}{name}={text}" for name, text in texts.items()]
+        values = {name: value for name, value in self.flags.items() if name != "type"}
+        given = env_type(self.flags["type"]).record.env_flags(values)
         evaluation = command("lerobot-eval", "--policy.path=CHECKPOINT", *given)
         return (
             f"---\n{metadata.to_yaml()}\n---\n\n# {self.repo_id.split('/')[-1]}\n\n"
@@ -88,11 +84,7 @@ def read_environment(repo_id: str, flags: Sequence[str]) -> PublishedEnvironment
     Raises:
         ValueError: a flag is unknown, is not of an environment, or has a value that is not allowed.
     """
-    import draccus
-    from lerobot.envs import EnvConfig
-    from lerobot.utils.import_utils import register_third_party_plugins
-
-    from lerobot_bomb.checkpoints.env_config import EvaluatedEnv
+    from lerobot_bomb.checkpoints.env_config import EvaluatedEnv, decode_env  # LeRobot: seconds
 
     pairs = [flag.partition("=")[::2] for flag in flags]
     if wrong := [name for name, _ in pairs if not name.startswith(PREFIX)]:
@@ -103,14 +95,8 @@ def read_environment(repo_id: str, flags: Sequence[str]) -> PublishedEnvironment
             raise ValueError(f"{PREFIX}{name} is a path of this machine; drop it")
     if "type" not in values:
         raise ValueError(f"{PREFIX}type is missing: it names the environment, as {PREFIX}type=bomb")
-    register_third_party_plugins()
-    one_of(f"{PREFIX}type", values["type"], sorted(EnvConfig.get_known_choices()))
     env_type(values["type"]).check()
-    try:
-        config = draccus.decode(EnvConfig, values)
-    except draccus.utils.DecodingError as error:
-        raise ValueError(str(error)) from None
-    if not isinstance(config, EvaluatedEnv):
+    if not isinstance(decode_env(values), EvaluatedEnv):
         raise ValueError(f"{PREFIX}type={values['type']} is no environment of lerobot_bomb")
     return PublishedEnvironment(repo_id, {"type": values.pop("type"), **values})
 

@@ -36,7 +36,7 @@ ORIGIN = {
     "simulator_versions", "lerobot_version", "torch_version", "package_version", "task_version",
     "protocol_version",
 }  # fmt: skip
-# fields of a record that differ when an episode is run again, bit for bit
+# fields of a record that differ when an episode is run again, bit for bit; smoothness does not
 MEASURED = {"inference"}
 
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import grpc
 
-MAX_OPEN = 8  # requests that are still being received; one more cancels the oldest of them
+# requests that are still being received; one more cancels the oldest of them: a robot sends the newest
+MAX_OPEN = 8
 RECEIVE_TIMEOUT_S = 10.0  # an observation that takes longer is of no use to a robot
 WORKERS = 2 * MAX_OPEN
 

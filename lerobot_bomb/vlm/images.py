@@ -1,5 +1,7 @@
 """Camera images -> inputs of a vision model, on tensors.
 
+They go straight to the model's size; the stock detour over 2048 pixels is meant for tiles.
+
 Shapes: `B` images, `H` and `W` their sides, `S` side of the model's input, all in pixels; `P` tokens of an
 image, `E` size of their embeddings.
 """

@@ -1,4 +1,7 @@
-"""Perturbation axis `dynamics`: how heavy and slippery objects are, and how the arm obeys."""
+"""Perturbation axis `dynamics`: how heavy and slippery objects are, and how the arm obeys.
+
+It acts once the objects have settled, so that none has moved before the episode.
+"""
 
 from dataclasses import dataclass
 from typing import Any, Self

@@ -11,7 +11,7 @@ from lerobot_env_bomb_libero.scene import LiberoScene, LiberoTransform
 
 @dataclass(frozen=True)
 class ObjectShade(LiberoTransform):
-    """Darker colours of the objects, with a little of one channel missing."""
+    """Darker colours of the objects, a little of one channel missing; another hue would belie the text."""
 
     factors: tuple[float, float, float]  # of red, green and blue
 

@@ -11,7 +11,7 @@ from lerobot_env_bomb_pusht.board import MIDDLE_PX, PushTTransform
 
 @dataclass(frozen=True)
 class PushTStart(PushTTransform):
-    """Block and agent start elsewhere, nearer to the board's middle in x and in y, so they stay on it."""
+    """Block and agent start elsewhere, nearer to the middle in x and y: at a wall no T can be pushed."""
 
     agent_px: tuple[float, float]  # along x and y
     block_px: tuple[float, float]
