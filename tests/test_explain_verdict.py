@@ -204,7 +204,7 @@ BOTH_FAIL = [without(["camera"], "object:3", "dropped"), without(["object"], "ca
     [
         (
             [without(["object"], "none", None)],
-            "The same seed succeeds without object (after 23 steps).",
+            "Without the perturbation object (after 23 steps), the same seed succeeds.",
         ),
         (
             [without(["object"], "none", "dropped")],
@@ -216,8 +216,8 @@ BOTH_FAIL = [without(["camera"], "object:3", "dropped"), without(["object"], "ca
                 without(["object"], "camera:3", None),
                 without(["camera", "object"], "none", None),
             ],
-            "The same seed succeeds without object (after 23 steps); leaving out one of the other 1 does not "
-            "help.",
+            "Without the perturbation object (after 23 steps), the same seed succeeds; leaving out any other "
+            "does not help.",
         ),
         (
             [*BOTH_FAIL, without(["camera", "object"], "none", None)],

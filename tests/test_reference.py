@@ -78,7 +78,7 @@ def test_every_axis_is_there(made: dict[str, str]) -> None:
     axes = {f"{env_type}: {axis}" for env_type, axes in own_axes().items() for axis in axes}
     assert axes == sections(made["axes.md"]).keys() >= {"bomb_libero: camera", "bomb_pusht: goal"}
     assert (
-        "| angle | 3 | 6 | 9 | 12.5 | 16 | degrees | around the board, in a drawn direction |"
+        "| angle | 3 | 6 | 9 | 12.5 | 16 | degrees | around the board, in a random direction |"
         in (FOLDER.parent / "perturbations.md").read_text()
     )
 

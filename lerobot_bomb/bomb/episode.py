@@ -62,7 +62,7 @@ class Failure(FailureClass):
         "time running out while the stone was between the pads or touched them, or lay on the target but not "
         "yet at rest",
     )
-    LIFTED = "lifted", "a stone lifted that was to be pushed (only in `goal`)"
+    LIFTED = "lifted", "a stone lifted instead of pushed (only in `goal`)"
 
 
 def check_seed(seed: int) -> None:

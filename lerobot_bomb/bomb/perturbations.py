@@ -17,7 +17,7 @@ _OWN = {
         "colour and pattern of the table, colour of the tray",
         ("images",),
         {
-            "color": Magnitude("share", (0.2, 0.4, 0.6, 0.8, 1.0), "of the way to a drawn colour"),
+            "color": Magnitude("share", (0.2, 0.4, 0.6, 0.8, 1.0), "of the way to a random colour"),
             "pattern": Magnitude(
                 "share", (0.06, 0.12, 0.2, 0.3, 0.45), "contrast of stripes, checks or speckles on the table"
             ),
@@ -39,21 +39,21 @@ _OWN = {
     ),
     "stones": Axis(
         "number of stones on the board, and their shift off the intersections",
-        ("images", "state"),
+        ("images", "scene"),
         {
             "extra": Magnitude("stones", (1, 1, 2, 2, 3), "additional on the board"),
-            "shift": Magnitude("mm", (0.8, 1.6, 2.4, 3.2, 4.0), "of each stone, in a drawn direction"),
+            "shift": Magnitude("mm", (0.8, 1.6, 2.4, 3.2, 4.0), "of each stone, in a random direction"),
         },
         "lerobot_env_bomb.axes.stones:Stones",
     ),
     "start": Axis(
         "where the gripper and the stone to be moved are at the start",
-        ("images", "state"),
+        ("images", "scene"),
         {
             "stone": Magnitude(
-                "mm", (16, 32, 48, 64, 82), "shift of the stones in the tray, to a drawn side"
+                "mm", (16, 32, 48, 64, 82), "shift of the stones in the tray, to a random side"
             ),
-            "gripper": Magnitude("mm", (16, 32, 48, 64, 82), "shift of the gripper, in a drawn direction"),
+            "gripper": Magnitude("mm", (16, 32, 48, 64, 82), "shift of the gripper, in a random direction"),
         },
         "lerobot_env_bomb.axes.start:Start",
     ),
@@ -61,8 +61,8 @@ _OWN = {
         "colour balance, brightness and noise of the camera's sensor",
         ("images",),
         {
-            "balance": Magnitude("share", (0.04, 0.08, 0.12, 0.17, 0.22), "more or less of a drawn channel"),
-            "brightness": Magnitude("share", (0.03, 0.06, 0.09, 0.12, 0.15), "more or less of all channels"),
+            "balance": Magnitude("share", (0.04, 0.08, 0.12, 0.17, 0.22), "up or down, one random channel"),
+            "brightness": Magnitude("share", (0.03, 0.06, 0.09, 0.12, 0.15), "up or down, all channels"),
             "noise": Magnitude("grey levels", (2, 4, 6, 8, 11), "standard deviation in each pixel"),
         },
         "lerobot_env_bomb.axes.photometric:Sensor",
@@ -71,8 +71,8 @@ _OWN = {
         "angle, field of view and distance of the cameras; board, tray and stone stay in view",
         ("images",),
         {
-            "angle": Magnitude("degrees", (3, 6, 9, 12.5, 16), "around the board, in a drawn direction"),
-            "wrist_angle": Magnitude("degrees", (1, 2, 3, 4, 5), "around the grip, in a drawn direction"),
+            "angle": Magnitude("degrees", (3, 6, 9, 12.5, 16), "around the board, in a random direction"),
+            "wrist_angle": Magnitude("degrees", (1, 2, 3, 4, 5), "around the grip, in a random direction"),
             "fov": Magnitude("share", (0.04, 0.08, 0.12, 0.16, 0.2), "wider or narrower, both cameras"),
             "distance": Magnitude(
                 "share", (0.03, 0.06, 0.09, 0.12, 0.15), "further or nearer, the workspace camera"
@@ -86,7 +86,7 @@ _OWN = {
         {
             "dim": Magnitude("factor", (0.88, 0.77, 0.67, 0.58, 0.5), "on all light, if it is dimmed"),
             "bright": Magnitude("factor", (1.15, 1.32, 1.52, 1.75, 2.0), "on all light, if it is brightened"),
-            "tilt": Magnitude("degrees", (7, 14, 21, 28, 35), "of the lamp, in a drawn direction"),
+            "tilt": Magnitude("degrees", (7, 14, 21, 28, 35), "of the lamp, in a random direction"),
         },
         "lerobot_env_bomb.axes.light:Light",
     ),
@@ -105,7 +105,7 @@ _OWN = {
             "noise": Magnitude(
                 "40 mm",
                 (0.01, 0.02, 0.03, 0.04, 0.05),
-                "standard deviation on executed x, y and z, in units of 40 mm",
+                "standard deviation on executed x, y and z; 0.01 is 0.4 mm",
             ),
             "latency": Magnitude("control steps", (0, 0, 0, 1, 1), "before an action is executed"),
         },
@@ -113,7 +113,7 @@ _OWN = {
     ),
     "object": Axis(
         "size, shape and shade of the stones",
-        ("images", "state"),
+        ("images", "scene"),
         {
             "radius": Magnitude("mm", (0.4, 0.8, 1.2, 1.6, 2.0), "more or less than 13 mm"),
             "height": Magnitude("mm", (0.5, 1.0, 1.5, 2.0, 2.5), "more or less than 9 mm"),
@@ -123,7 +123,7 @@ _OWN = {
         "lerobot_env_bomb.axes.object:StoneLook",
     ),
     "goal_marker": Axis(
-        "a blue dot on the target, as the original benchmark drew it",
+        "a blue dot on the target",
         ("images",),
         {"radius": Magnitude("mm", (3, 4.5, 6, 8, 10), "of the dot")},
         "lerobot_env_bomb.axes.goal_marker:GoalMarker",

@@ -88,10 +88,9 @@ def without_perturbations(counterfactuals: Sequence[Values]) -> list[str]:
     single = [each for each in counterfactuals if len(each["without"]) == 1]
     helped = [each for each in single if each["result"]["is_success"]]
     if helped:
-        ways = [f"without {each['without'][0]}{_steps(each['result'])}" for each in helped]
-        rest = len(single) - len(helped)
-        others = f"; leaving out one of the other {rest} does not help" if rest else ""
-        return [f"The same seed succeeds {in_a_row(ways, 'or')}{others}."]
+        ways = [f"{each['without'][0]}{_steps(each['result'])}" for each in helped]
+        others = "; leaving out any other does not help" if len(helped) < len(single) else ""
+        return [f"Without the perturbation {in_a_row(ways, 'or')}, the same seed succeeds{others}."]
     if clean["result"]["is_success"]:
         told = f"The same seed succeeds unperturbed{_steps(clean['result'])}"
         return [f"{told}, but without any single perturbation it fails too: they break it together."]

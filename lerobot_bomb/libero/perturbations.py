@@ -13,7 +13,7 @@ _OWN = {
         "colour and pattern of table and floor",
         ("images",),
         {
-            "color": Magnitude("share", (0.12, 0.24, 0.36, 0.48, 0.6), "of the way to a drawn colour"),
+            "color": Magnitude("share", (0.12, 0.24, 0.36, 0.48, 0.6), "of the way to a random colour"),
             "pattern": Magnitude(
                 "share", (0.06, 0.12, 0.2, 0.3, 0.45), "contrast of stripes, checks or speckles"
             ),
@@ -41,10 +41,10 @@ _OWN = {
     ),
     "start": Axis(
         "where objects and the arm are at the start",
-        ("images", "state"),
+        ("images", "scene"),
         {
             "objects": Magnitude(
-                "mm", (10, 20, 30, 40, 50), "of each that stands free, in a drawn direction"
+                "mm", (10, 20, 30, 40, 50), "of each that stands free, in a random direction"
             ),
             "arm": Magnitude(
                 "radians", (0.04, 0.08, 0.12, 0.16, 0.2), "of its joints, root of sum of squares"
@@ -59,8 +59,8 @@ _OWN = {
         "angle, field of view and distance of the cameras; what was in view stays in view",
         ("images",),
         {
-            "angle": Magnitude("degrees", (4, 8, 12, 16, 20), "around the table, in a drawn direction"),
-            "wrist_angle": Magnitude("degrees", (1, 2, 3, 4, 5), "around the gripper, in a drawn direction"),
+            "angle": Magnitude("degrees", (4, 8, 12, 16, 20), "around the table, in a random direction"),
+            "wrist_angle": Magnitude("degrees", (1, 2, 3, 4, 5), "around the gripper, in a random direction"),
             "fov": Magnitude("share", (0.04, 0.08, 0.12, 0.16, 0.2), "wider or narrower, both cameras"),
             "distance": Magnitude(
                 "share", (0.03, 0.06, 0.09, 0.12, 0.15), "further or nearer, the scene's camera"
@@ -90,7 +90,7 @@ _OWN = {
         ("images",),
         {
             "shade": Magnitude("factor", (0.87, 0.75, 0.64, 0.55, 0.47), "of their colour"),
-            "tint": Magnitude("share", (0.04, 0.08, 0.12, 0.16, 0.2), "less of a drawn channel"),
+            "tint": Magnitude("share", (0.04, 0.08, 0.12, 0.16, 0.2), "less of one random channel"),
         },
         "lerobot_env_bomb_libero.axes.object:ObjectShade",
     ),

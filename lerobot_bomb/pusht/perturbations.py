@@ -17,7 +17,9 @@ _OWN = {
         "colour and pattern of the board",
         ("images",),
         {
-            "color": Magnitude("share", (0.2, 0.4, 0.6, 0.8, 1.0), "of the way from white to a drawn colour"),
+            "color": Magnitude(
+                "share", (0.2, 0.4, 0.6, 0.8, 1.0), "of the way from white to a random colour"
+            ),
             "pattern": Magnitude(
                 "share", (0.05, 0.09, 0.13, 0.17, 0.21), "darkness of stripes, checks or speckles"
             ),
@@ -26,10 +28,10 @@ _OWN = {
     ),
     "start": Axis(
         "where block and agent are at the start",
-        ("images", "state"),
+        ("images", "scene"),
         {
             "block": Magnitude("pixels", (20, 40, 60, 80, 100), "of the block, towards the board's middle"),
-            "turn": Magnitude("degrees", (15, 30, 45, 60, 75), "of the block, to a drawn side"),
+            "turn": Magnitude("degrees", (15, 30, 45, 60, 75), "of the block, to a random side"),
             "agent": Magnitude("pixels", (20, 40, 60, 80, 100), "of the agent, towards the board's middle"),
         },
         "lerobot_env_bomb_pusht.axes.start:PushTStart",
@@ -54,15 +56,15 @@ _OWN = {
     "object": Axis(
         "shade of the block",
         ("images",),
-        {"shade": Magnitude("share", (0.2, 0.4, 0.6, 0.8, 1.0), "of the way to a drawn colour")},
+        {"shade": Magnitude("share", (0.2, 0.4, 0.6, 0.8, 1.0), "of the way to a random colour")},
         "lerobot_env_bomb_pusht.axes.object:BlockShade",
     ),
     "goal": Axis(
         "where the target lies, which the instruction then says",
         ("images", "instruction", "goal"),
         {
-            "shift": Magnitude("pixels", (16, 32, 48, 64, 80), "of the target, in a drawn direction"),
-            "turn": Magnitude("degrees", (12, 24, 36, 48, 60), "of the target, to a drawn side"),
+            "shift": Magnitude("pixels", (16, 32, 48, 64, 80), "of the target, in a random direction"),
+            "turn": Magnitude("degrees", (12, 24, 36, 48, 60), "of the target, to a random side"),
         },
         "lerobot_env_bomb_pusht.axes.goal:GoalPose",
     ),
