@@ -204,7 +204,7 @@ BOTH_FAIL = [without(["camera"], "object:3", "dropped"), without(["object"], "ca
     [
         (
             [without(["object"], "none", None)],
-            "Without the perturbation object (after 23 steps), the same seed succeeds.",
+            "Without the axis object (after 23 steps), the same seed succeeds.",
         ),
         (
             [without(["object"], "none", "dropped")],
@@ -216,7 +216,7 @@ BOTH_FAIL = [without(["camera"], "object:3", "dropped"), without(["object"], "ca
                 without(["object"], "camera:3", None),
                 without(["camera", "object"], "none", None),
             ],
-            "Without the perturbation object (after 23 steps), the same seed succeeds; leaving out any other "
+            "Without the axis object (after 23 steps), the same seed succeeds; leaving out any other "
             "does not help.",
         ),
         (

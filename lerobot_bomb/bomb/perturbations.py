@@ -118,7 +118,7 @@ _OWN = {
             "radius": Magnitude("mm", (0.4, 0.8, 1.2, 1.6, 2.0), "more or less than 13 mm"),
             "height": Magnitude("mm", (0.5, 1.0, 1.5, 2.0, 2.5), "more or less than 9 mm"),
             "shade": Magnitude("share", (0.06, 0.12, 0.19, 0.25, 0.32), "of the way to grey, both colours"),
-            "flat": Magnitude("yes", (0, 0, 1, 1, 1), "discs instead of lenses"),
+            "flat": Magnitude("1 = yes", (0, 0, 1, 1, 1), "flat discs, not lens-shaped stones"),
         },
         "lerobot_env_bomb.axes.object:StoneLook",
     ),

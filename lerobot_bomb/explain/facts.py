@@ -90,7 +90,7 @@ def without_perturbations(counterfactuals: Sequence[Values]) -> list[str]:
     if helped:
         ways = [f"{each['without'][0]}{_steps(each['result'])}" for each in helped]
         others = "; leaving out any other does not help" if len(helped) < len(single) else ""
-        return [f"Without the perturbation {in_a_row(ways, 'or')}, the same seed succeeds{others}."]
+        return [f"Without the axis {in_a_row(ways, 'or')}, the same seed succeeds{others}."]
     if clean["result"]["is_success"]:
         told = f"The same seed succeeds unperturbed{_steps(clean['result'])}"
         return [f"{told}, but without any single perturbation it fails too: they break it together."]
