@@ -204,7 +204,7 @@ BOTH_FAIL = [without(["camera"], "object:3", "dropped"), without(["object"], "ca
     [
         (
             [without(["object"], "none", None)],
-            "Without the axis object (after 23 steps), the same seed succeeds.",
+            'The same seed succeeds without axis "object" (in 23 steps).',
         ),
         (
             [without(["object"], "none", "dropped")],
@@ -216,12 +216,11 @@ BOTH_FAIL = [without(["camera"], "object:3", "dropped"), without(["object"], "ca
                 without(["object"], "camera:3", None),
                 without(["camera", "object"], "none", None),
             ],
-            "Without the axis object (after 23 steps), the same seed succeeds; leaving out any other "
-            "does not help.",
+            'The same seed succeeds without axis "object" (in 23 steps); leaving out any other does not help.',
         ),
         (
             [*BOTH_FAIL, without(["camera", "object"], "none", None)],
-            "The same seed succeeds unperturbed (after 23 steps), but without any single perturbation it "
+            "The same seed succeeds unperturbed (in 23 steps), but without any single perturbation it "
             "fails too: they break it together.",
         ),
     ],

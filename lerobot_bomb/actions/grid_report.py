@@ -119,4 +119,4 @@ def cells_text(groups: Collection[ActionGroup]) -> str:
         for group in groups
     )
     alone = all(len(group.dims) == 1 for group in groups)
-    return f"one token per {'dimension, not per group' if alone else 'group'} ({cells} cells)"
+    return f"one token per {'dimension' if alone else 'group'} ({cells} cells){', not per group' * alone}"

@@ -88,9 +88,9 @@ def without_perturbations(counterfactuals: Sequence[Values]) -> list[str]:
     single = [each for each in counterfactuals if len(each["without"]) == 1]
     helped = [each for each in single if each["result"]["is_success"]]
     if helped:
-        ways = [f"{each['without'][0]}{_steps(each['result'])}" for each in helped]
+        ways = [f'"{each["without"][0]}"{_steps(each["result"])}' for each in helped]
         others = "; leaving out any other does not help" if len(helped) < len(single) else ""
-        return [f"Without the axis {in_a_row(ways, 'or')}, the same seed succeeds{others}."]
+        return [f"The same seed succeeds without axis {in_a_row(ways, 'or')}{others}."]
     if clean["result"]["is_success"]:
         told = f"The same seed succeeds unperturbed{_steps(clean['result'])}"
         return [f"{told}, but without any single perturbation it fails too: they break it together."]
@@ -99,7 +99,7 @@ def without_perturbations(counterfactuals: Sequence[Values]) -> list[str]:
 
 
 def _steps(result: Values) -> str:
-    return f" (after {result['steps']} steps)" if "steps" in result else ""
+    return f" (in {result['steps']} steps)" if "steps" in result else ""
 
 
 def turned_right(result: Values, masked: Mapping[str, Values]) -> list[str]:

@@ -44,7 +44,7 @@ class PointingVlaConfig(VlaConfig):
         require_labels(meta, reads_board=self.reads_board)
 
     def methods(self) -> list[str]:
-        return [*super().methods(), *(["points before it acts"] if self.pointing else [])]
+        return [*super().methods(), *(["pointing first"] if self.pointing else [])]
 
 
 @dataclass
