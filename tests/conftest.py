@@ -280,8 +280,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     chosen = metafunc.config.getoption("policy_type")
     types = [chosen] if chosen else POLICY_TYPES
     if "options" in metafunc.fixturenames:
-        is_long = metafunc.definition.get_closest_marker("long") is not None
-        variants = [variant for each in types for variant in variants_of(each, is_long=is_long)]
+        variants = [variant for each in types for variant in variants_of(each)]
         metafunc.parametrize(("policy_type", "options"), variants)
     else:
         one_type = not chosen and metafunc.definition.get_closest_marker("one_type")

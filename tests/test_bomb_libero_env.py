@@ -101,6 +101,7 @@ def make_current(stock: Any) -> None:
     stock._env.sim._render_context_offscreen.gl_ctx.make_current()
 
 
+@pytest.mark.long
 def test_level_0_is_lerobots_environment_bit_for_bit(env: Any) -> None:
     from lerobot.envs.factory import make_env, make_env_config
 

@@ -13,7 +13,7 @@ from lerobot_bomb.commands.explain import free_folder
 from lerobot_bomb.commands.main import main
 
 MAX_BYTES = 5e6  # of a page
-MAX_STEPS = 40  # of an episode; the policies need fewer
+MAX_STEPS = 28  # of an episode; the policies need fewer
 
 
 @pytest.fixture(autouse=True)

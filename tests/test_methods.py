@@ -17,7 +17,7 @@ from lerobot_bomb.checkpoints.shipped import FOLDER
 from lerobot_bomb.hub.card import Checkpoint
 
 ROOT = Path(__file__).parents[1]
-COLUMN = "which of its paper's methods it uses, and which not"
+COLUMN = "settings (many differ from its paper's)"
 SUITES = "fdvla_suites"
 
 
@@ -34,7 +34,7 @@ def methods(policy_type: str, recipe: str = "all_targets") -> list[str]:
 
 
 def of_recipe(policy_type: str, recipe: str = "all_targets") -> str:
-    return ", ".join(methods(policy_type, recipe))
+    return "; ".join(methods(policy_type, recipe))
 
 
 def methods_of_shipped(name: str) -> list[str]:
@@ -43,7 +43,7 @@ def methods_of_shipped(name: str) -> list[str]:
 
 
 def of_shipped(name: str) -> str:
-    return ", ".join(methods_of_shipped(name))
+    return "; ".join(methods_of_shipped(name))
 
 
 def tables(page: str) -> list[list[list[str]]]:
@@ -84,13 +84,13 @@ def test_the_page_of_results_says_what_the_configs_do() -> None:
 def test_the_readme_says_what_the_configs_do() -> None:
     """Check each policy's own methods, and those that it says all of them use."""
     (shared,) = re.findall(r"^All four: (.*?)\.", (ROOT / "README.md").read_text(), re.M | re.S)
-    shared = " ".join(shared.split()).split(", ")
+    shared = " ".join(shared.split()).split("; ")
     used = {**{name: methods(name) for name in CASES}, SUITES: methods_of_shipped(SUITES)}
     assert {name: [each for each in used[name] if each in shared] for name in used} == dict.fromkeys(
         used, shared
     )
     assert {names_of(cell): written for cell, written in cells("README.md")} == {
-        name: ", ".join(each for each in used[name] if each not in shared) for name in used
+        name: "; ".join(each for each in used[name] if each not in shared) for name in used
     }
 
 

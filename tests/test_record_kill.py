@@ -162,6 +162,7 @@ def test_a_recording_killed_at_random_moments_loses_nothing(
     assert sorted(tmp_path.iterdir()) == sorted(tmp_path / f"{number}" for number in range(recording))
 
 
+@pytest.mark.long
 def test_ctrl_c_and_sigterm_say_what_is_kept(
     server: RecorderServer, references: dict[str, Reference], tmp_path: Path
 ) -> None:

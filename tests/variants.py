@@ -27,7 +27,7 @@ FULL_LOSS: Options = {"loss_vocab": "full"}
 TWO_LAYERS: Options = {"nano_config": {"text_config": {"num_hidden_layers": 2}}}
 SHORT_CHUNKS: Options = {"chunk_size": 3, "n_action_steps": 3}
 # by policy type
-SINGLE: dict[str, dict[str, Options]] = {
+OPTIONS: dict[str, dict[str, Options]] = {
     "vla0_smol": {
         "ensemble": ENSEMBLE,
         "no_masking": NO_MASKING,
@@ -45,18 +45,6 @@ SINGLE: dict[str, dict[str, Options]] = {
         "denoise_only": DENOISE_ONLY,
         "causal_segment": CAUSAL_SEGMENT,
         "pool_all": POOL_ALL,
-    },
-}
-# two at once, for the fast tests: what passes with both holds for each, and costs half
-PAIRS: dict[str, dict[str, Options]] = {
-    "vla0_smol": {
-        "centers_no_masking": CENTERS | NO_MASKING,
-        # two chunks, as every predicted step costs
-        "fixed_width_ensemble": FIXED_WIDTH | ENSEMBLE | {"temporal_ensemble_size": 2},
-    },
-    "spatialvla_grid": {
-        "causal_quantile": CAUSAL | QUANTILE,
-        "full_loss_ensemble": FULL_LOSS | ENSEMBLE | {"temporal_ensemble_size": 2},
     },
 }
 
@@ -80,16 +68,16 @@ def layers_of(options: Options) -> Options:
     return {} if "vlm_model_name" in options else TWO_LAYERS
 
 
-def variants_of(policy_type: str, *, is_long: bool) -> list[Any]:
-    """Parameters (policy_type, options): the recipe, then options, in pairs unless there is time for each."""
-    variants = [pytest.param(policy_type, {}, id=policy_type)]
-    for group, marks in ((PAIRS, ()), (SINGLE, (pytest.mark.long,))):
-        if group is SINGLE or not is_long:
-            variants += [
-                pytest.param(policy_type, options, id=f"{policy_type}-{name}", marks=marks)
-                for name, options in group.get(policy_type, {}).items()
-            ]
-    return variants
+def variants_of(policy_type: str) -> list[Any]:
+    """Parameters (policy_type, options): the recipe, then, if there is time, each of its options."""
+    options = OPTIONS.get(policy_type, {})
+    return [
+        pytest.param(policy_type, {}, id=policy_type),
+        *(
+            pytest.param(policy_type, each, id=f"{policy_type}-{name}", marks=pytest.mark.long)
+            for name, each in options.items()
+        ),
+    ]
 
 
 def as_flags(options: Options) -> list[str]:

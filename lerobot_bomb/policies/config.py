@@ -120,7 +120,7 @@ class ChunkConfig(ConfigWithEnvironment):
         check_cameras_and_action(self)
 
     def methods_used(self) -> str:
-        return ", ".join(self.methods())
+        return "; ".join(self.methods())
 
     def methods(self) -> list[str]:
         size = self.chunk_size
