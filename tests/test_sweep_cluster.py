@@ -145,6 +145,7 @@ def submit(printed: str) -> None:
     assert done.stdout == "Submitted batch job 1\n", done.stderr
 
 
+@pytest.mark.long
 def test_commands_of_a_slurm_script_run_everything(
     expected_lines: str,
     jobs: list[list[str]],

@@ -75,7 +75,9 @@ def real_tokens_policy(shared_data: Path, tmp_path_factory: pytest.TempPathFacto
     return make_policy(vlm_model_name=str(folder))
 
 
-@pytest.mark.parametrize("system_prompt", [None, "Write numbers, 0 to 511."])
+@pytest.mark.parametrize(
+    "system_prompt", [None, pytest.param("Write numbers, 0 to 511.", marks=pytest.mark.long)]
+)
 def test_sequence_equals_the_real_processors(
     real_tokens_policy: Vla0SmolPolicy, shared_data: Path, system_prompt: str | None
 ) -> None:

@@ -27,7 +27,9 @@ def published_qwen(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) 
     return make_policy(vlm_model_name=str(folder))
 
 
-@pytest.mark.parametrize("system_prompt", [None, "Write numbers, 0 to 511."])
+@pytest.mark.parametrize(
+    "system_prompt", [None, pytest.param("Write numbers, 0 to 511.", marks=pytest.mark.long)]
+)
 def test_the_sequence_is_that_of_qwens_real_processor(
     published_qwen: Vla0SmolPolicy, shared_data: Path, system_prompt: str | None
 ) -> None:
