@@ -216,7 +216,8 @@ BOTH_FAIL = [without(["camera"], "object:3", "dropped"), without(["object"], "ca
                 without(["object"], "camera:3", None),
                 without(["camera", "object"], "none", None),
             ],
-            'The same seed succeeds without axis "object" (in 23 steps); leaving out any other does not help.',
+            'The same seed succeeds without axis "object" (in 23 steps); leaving out any other does not '
+            "help.",
         ),
         (
             [*BOTH_FAIL, without(["camera", "object"], "none", None)],

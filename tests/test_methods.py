@@ -123,7 +123,7 @@ def test_what_each_type_says() -> None:
         "no colour jitter",
     ]
     assert grid(depth_source="observation", n_action_steps=1, temporal_ensemble_size=4).methods() == [
-        "one token per group (polar 16 x 32 x 8, 16 cells), adaptive edges (gaussian)",
+        "one token per group (polar 16 x 32 x 8, 16 cells, adaptive gaussian edges)",
         "chunk of 4, 1 executed",
         "ensemble of 4 (adaptive)",
         "crop to 0.9",

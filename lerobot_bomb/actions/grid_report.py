@@ -112,11 +112,11 @@ def _group_rest_text(rho_N: np.ndarray, is_still_N: np.ndarray, dead: float) -> 
     ), True
 
 
-def cells_text(groups: Collection[ActionGroup]) -> str:
-    """Describe the tokens of an action, and how many cells each chooses from."""
+def cells_text(groups: Collection[ActionGroup], edges: str) -> str:
+    """Describe the tokens of an action, and how many cells with which edges each chooses from."""
     cells = ", ".join(
         f"{group.transform} " * (group.transform != "identity") + " x ".join(map(str, group.bins))
         for group in groups
     )
     alone = all(len(group.dims) == 1 for group in groups)
-    return f"one token per {'dimension' if alone else 'group'} ({cells} cells){', not per group' * alone}"
+    return f"one token per {'dimension, not per group' if alone else 'group'} ({cells} cells, {edges})"

@@ -42,7 +42,7 @@ class Stage(StrEnum):
 class Failure(FailureClass):
     """Reason why an episode failed; exactly one per failed episode."""
 
-    NEVER_REACHED = "never_reached", "the gripper never around the stone"
+    NEVER_REACHED = "never_reached", "the stone never between the pads"
     MISSED_GRASP = "missed_grasp", "the stone never lifted"
     DROPPED = (
         "dropped",
@@ -59,8 +59,8 @@ class Failure(FailureClass):
     )
     TIMEOUT_HOLDING = (
         "timeout_holding",
-        "time running out while the stone was between the pads or touched them, or lay on the target but not "
-        "yet at rest",
+        "time running out while both pads touched the stone or, once it had been lifted, while a pad touched "
+        "it or it lay on the target, not yet at rest",
     )
     LIFTED = "lifted", "a stone lifted instead of pushed (only in `goal`)"
 

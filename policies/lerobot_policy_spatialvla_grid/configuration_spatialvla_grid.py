@@ -176,10 +176,10 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
 
     def methods(self) -> list[str]:
         kind = self.grid_distribution
-        edges = "uniform edges" if kind == "uniform" else f"adaptive edges ({kind})"
+        edges = "uniform edges" if kind == "uniform" else f"adaptive {kind} edges"
         has_depth = self.depth_source != "none"
         return [
-            f"{cells_text(self.grid_settings().groups)}, {edges}",
+            cells_text(self.grid_settings().groups, edges),
             *super().methods(),
             f"3-D positions by depth ({self.depth_source})" if has_depth else "no depth, no 3-D positions",
         ]
