@@ -259,7 +259,7 @@ def test_off_there_are_no_rows_and_no_labels() -> None:
     assert policy.cell_head.weight.shape[0] == policy.cell_embedding.num_embeddings == policy.grids.num_tokens
     assert {*policy.state_dict()} == {*pointing_policy().state_dict()}
     assert set(policy(make_batch(policy, 2))[1]) == {"token_accuracy"}
-    method = "pointing first"
+    method = "stone and destination predicted first"
     assert method not in policy.config.methods() and method in pointing_policy().config.methods()
 
 

@@ -116,7 +116,7 @@ def test_off_there_is_nothing_of_it() -> None:
         losses.append(policy.train()(each)[0])
     assert torch.equal(*losses)
     assert policy.write(batch, 3).shape == (2, 12)
-    assert "pointing first" not in policy.config.methods_used()
+    assert "stone and destination predicted first" not in policy.config.methods_used()
     # a checkpoint of before keeps its identity
     later = {name: getattr(policy.config, name) for name in policy.config.LATER_FIELDS}
     expected = {"counterfactual_share": 0.5, "board_loss_weight": 1.0, "pointing_range_m": 0.3}

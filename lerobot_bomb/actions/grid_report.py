@@ -118,5 +118,7 @@ def cells_text(groups: Collection[ActionGroup], edges: str) -> str:
         f"{group.transform} " * (group.transform != "identity") + " x ".join(map(str, group.bins))
         for group in groups
     )
-    alone = all(len(group.dims) == 1 for group in groups)
-    return f"one token per {'dimension, not per group' if alone else 'group'} ({cells} cells, {edges})"
+    described = f"({cells} cells, {edges})"
+    if all(len(group.dims) == 1 for group in groups):
+        return f"one token per dimension {described}, not per group"
+    return f"one token per group {described}"

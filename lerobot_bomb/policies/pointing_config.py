@@ -44,7 +44,7 @@ class PointingVlaConfig(VlaConfig):
         require_labels(meta, reads_board=self.reads_board)
 
     def methods(self) -> list[str]:
-        return [*super().methods(), *(["pointing first"] if self.pointing else [])]
+        return [*super().methods(), *(["stone and destination predicted first"] if self.pointing else [])]
 
 
 @dataclass
