@@ -87,9 +87,10 @@ def resized_pixels(images_B3HW: Tensor, size: int) -> Tensor:
 def resize(images_B3HW: Tensor, size: int) -> Tensor:
     """(B, 3, H, W) in [0, 1] -> (B, 3, size, size) in [0, 1], as Pillow's Lanczos filter does it.
 
-    ``AutoProcessor`` uses that for SmolVLM. Lines are resampled first, then columns, each by a product with a
-    fixed matrix. As in Pillow, both results are 8-bit levels, so overshoot at edges is cut off in between.
-    Images that are not square are stretched. The result is Pillow's, but for a level where rounding is a tie.
+    ``AutoProcessor`` uses that for SmolVLM; bicubic differs by up to 24 levels. Lines are resampled first,
+    then columns, each by a product with a fixed matrix. As in Pillow, both results are 8-bit levels, so
+    overshoot at edges is cut off in between. Images that are not square are stretched. The result is
+    Pillow's, but for a level where rounding is a tie.
     """
     return _resized_levels(images_B3HW, size).div_(255)
 
