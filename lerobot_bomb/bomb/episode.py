@@ -59,8 +59,8 @@ class Failure(FailureClass):
     )
     TIMEOUT_HOLDING = (
         "timeout_holding",
-        "time running out while both pads touched the stone; or, if it was lifted before, while a pad "
-        "touched it or it lay on the target, still moving",
+        "time running out while both pads touched the stone or, after a lift, while one pad did or it was "
+        "still moving on the target",
     )
     LIFTED = "lifted", "a stone lifted instead of pushed (only in `goal`)"
 
