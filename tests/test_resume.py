@@ -1,4 +1,4 @@
-"""`lerobot-train --resume=true` goes on as if it had never stopped."""
+"""`lerobot-train` resumes as if it had never stopped, and trains a checkpoint further."""
 
 import json
 import shutil
@@ -17,11 +17,14 @@ REPO_ID = "overfit/bomb_place"
 NUM_FRAMES = 5  # three batches an epoch
 
 
+def recorded(folder: Path, seed: int) -> Path:
+    record(Recording(REPO_ID, episodes=1, seed=seed, image_size=64, images=True), folder / "dataset")
+    return folder / "dataset"
+
+
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("recorded") / "dataset"
-    record(Recording(REPO_ID, episodes=1, seed=3, image_size=64, images=True), root)
-    return root
+    return recorded(tmp_path_factory.mktemp("recorded"), seed=3)
 
 
 @pytest.fixture
@@ -73,3 +76,39 @@ def test_a_resumed_training_is_the_uninterrupted_one(
     assert weights(second, 4) == weights(whole, 4)
     config = json.loads((second / "checkpoints" / "000004" / "pretrained_model" / "config.json").read_text())
     assert config["trained_batches"] == 4
+
+
+def statistics(checkpoint: Path) -> dict[str, bytes]:
+    """Return the files of a checkpoint's statistics."""
+    return {path.name: path.read_bytes() for path in checkpoint.glob("*normalizer_processor.safetensors")}
+
+
+@pytest.mark.one_type
+def test_further_training_keeps_the_statistics_of_its_checkpoint_or_takes_the_datasets(
+    policy_type: str, stock_cli: Run, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--batch_size=2", "--num_workers=0", "--steps=1", "--save_freq=1"]
+    last = Path("checkpoints", "last", "pretrained_model")
+    recipe = f"--config_path={recipe_path('overfit', policy_type)}"
+    stock_cli("lerobot-train", recipe, *flags, f"--dataset.root={dataset}", f"--output_dir={tmp_path / 'a'}")
+    before = statistics(tmp_path / "a" / last)
+    assert len(before) == 2
+    other = [*flags, f"--dataset.repo_id={REPO_ID}", f"--dataset.root={recorded(tmp_path, seed=4)}"]
+    for name, keeps in (("kept", "true"), ("new", "false")):
+        stock_cli(
+            "lerobot-train", f"--policy.path={tmp_path / 'a' / last}", *other,
+            f"--policy.keep_statistics={keeps}", f"--output_dir={tmp_path / name}",
+        )  # fmt: skip
+        assert (statistics(tmp_path / name / last) == before) == (name == "kept")
+        assert capsys.readouterr().err.count("--policy.keep_statistics=true keeps its own") == (name == "new")
+
+
+@pytest.mark.one_type
+def test_without_a_checkpoint_there_are_no_statistics_to_keep(
+    policy_type: str, stock_cli: Run, dataset: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=r"keep_statistics=true needs --policy\.path"):
+        stock_cli(
+            "lerobot-train", f"--config_path={recipe_path('overfit', policy_type)}",
+            f"--dataset.root={dataset}", "--policy.keep_statistics=true", f"--output_dir={tmp_path / 'x'}",
+        )  # fmt: skip

@@ -3,9 +3,11 @@
 LeRobot imports and calls whatever `class` a step names, before it checks the result.
 """
 
+import logging
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -21,10 +23,13 @@ from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PR
 from safetensors import safe_open
 
 from lerobot_bomb.actions.relative import BOUND_STATISTICS, CENTRE_AND_DISTANCE
+from lerobot_bomb.compat.hooks.policies import built_policies
 from lerobot_bomb.compat.hooks.processors import check_processors_before_use
 from lerobot_bomb.files import read_json
 from lerobot_bomb.finite import require_finite
 from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep
+
+logger = logging.getLogger(__name__)
 
 STATE_SUFFIX = ".safetensors"
 
@@ -169,9 +174,24 @@ def check_saved_processors() -> None:
         for name in state_files(content, where, saved_type(config)):
             refuse_link_out(config.parent / name)
 
-    check_processors_before_use(
-        check,
-        _check_loaded,
+    check_processors_before_use(check, _check_loaded, _keeps_statistics)
+
+
+def _keeps_statistics() -> bool:
+    """Return whether a training keeps the statistics of the checkpoint that LeRobot has just loaded."""
+    for policy in built_policies()[-1:]:
+        if (keeps := getattr(policy.config, "keep_statistics", None)) is False:
+            _warn_of_new_statistics(policy.config.pretrained_path)
+        return bool(keeps)
+    return False
+
+
+@cache
+def _warn_of_new_statistics(checkpoint: Path | None) -> None:
+    logger.warning(
+        "%s will be trained with the statistics of the new dataset, so that its first actions have other "
+        "sizes; --policy.keep_statistics=true keeps its own",
+        checkpoint,
     )
 
 

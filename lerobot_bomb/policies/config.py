@@ -10,6 +10,7 @@ from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 from lerobot_bomb.actions.ensemble import WEIGHTINGS
 from lerobot_bomb.checkpoints.config import INSTALLED, PackageVersion
 from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
+from lerobot_bomb.compat.hooks.policies import training_data
 from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.policies.pointing import LABELS
@@ -66,6 +67,8 @@ class ChunkConfig(ConfigWithEnvironment):
             "ACTION": NormalizationMode.MIN_MAX,
         }
     )
+    # train on with the statistics of --policy.path, so that its weights mean what they did, not the dataset's
+    keep_statistics: bool = False
     # also train on actions beyond an episode's end, which repeat the last one
     loss_on_padded_actions: bool = False
     # frames at an episode's end that no sample starts at
@@ -118,6 +121,8 @@ class ChunkConfig(ConfigWithEnvironment):
     def validate_features(self) -> None:
         """Raise unless the dataset or environment has all features that the policy reads and writes."""
         check_cameras_and_action(self)
+        if self.keep_statistics and training_data(self) is not None and self.pretrained_path is None:
+            raise ValueError("--policy.keep_statistics=true needs --policy.path, whose statistics to keep")
 
     def methods_used(self) -> str:
         return "; ".join(self.methods())
