@@ -44,7 +44,7 @@ def clustered_interval(successes_C: np.ndarray, counts_C: np.ndarray) -> tuple[f
 
     It is Wilson's interval of the effective number of independent records, which lies between the numbers of
     clusters and records, with Student's t for the number of clusters. For clusters of one record each, it is
-    Wilson's interval itself.
+    Wilson's interval itself; where all records count or none, that of the clusters.
     Source: Dean and Pagano (2015), "Evaluating confidence interval methods for binomial proportions in
     clustered surveys".
     """
@@ -56,10 +56,10 @@ def clustered_interval(successes_C: np.ndarray, counts_C: np.ndarray) -> tuple[f
     from scipy.special import stdtrit
 
     rate = successes_C.sum() / n
+    if rate in (0, 1):  # nothing tells how alike the records of a cluster are: as if they were one
+        return wilson_interval(int(rate) * num_clusters, num_clusters)
     spread = ((successes_C - rate * counts_C) ** 2).sum() * num_clusters / (num_clusters - 1)
     num_effective = n**2 * rate * (1 - rate) / spread if spread > 0 else n
-    if rate in (0, 1):  # nothing tells how alike the records of a cluster are
-        num_effective = num_clusters
     num_effective = min(max(num_effective, num_clusters), n)
     return _wilson(float(rate), float(num_effective), float(stdtrit(num_clusters - 1, 0.975)))
 

@@ -62,9 +62,9 @@ def test_records_of_one_seed_count_as_one_where_they_agree() -> None:
     [
         ([1, 0, 1, 1], [1, 1, 1, 1], wilson_interval(3, 4)),  # a record each: independent
         ([7], [11], None),  # one seed alone tells nothing of others
-        # always: as two records, with t of one degree of freedom
-        ([3, 3], [3, 3], (2 / (2 + 12.706**2), 1.0)),
-        ([0, 0], [3, 3], (0.0, 12.706**2 / (2 + 12.706**2))),
+        # always: at worst two records, and no variance that would be estimated
+        ([3, 3], [3, 3], wilson_interval(2, 2)),
+        ([0, 0], [3, 3], wilson_interval(0, 2)),
         # as independent as can be: no more than there are, with t of three degrees of freedom
         ([1, 1, 1, 1], [2, 2, 2, 2], (0.5 - 0.3737, 0.5 + 0.3737)),
     ],
