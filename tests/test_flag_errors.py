@@ -168,10 +168,23 @@ def test_a_wrong_flag_of_other_types_is_told_as_lerobot_tells_it(
     assert ("usage: " in errors) is ("unrecognized" in message)
 
 
-def test_our_commands_name_the_nearest_flag_too(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("view --sed=9", "unrecognized arguments: --sed=9; nearest: --seed"),
+        # not that one of --episodes and --static is required
+        ("record --repo_id=a/b --epsiodes=2", "unrecognized arguments: --epsiodes=2; nearest: --episodes"),
+        ("sweep out --polices=act", "unrecognized arguments: --polices=act; nearest: --policies"),
+        ("record --repo_id=a/b", "one of the arguments --episodes --static is required"),
+    ],
+)
+def test_our_commands_name_the_nearest_flag_too(
+    words: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
-        main(["view", "--sed=9"])
-    assert capsys.readouterr().err.endswith("unrecognized arguments: --sed=9; nearest: --seed\n")
+        main(words.split())
+    command = f"lerobot-bomb {words.split()[0]}"
+    assert capsys.readouterr().err == f"{command}: {message} (`{command} --help` lists all flags)\n"
 
 
 def test_a_flag_of_a_group_is_compared_with_those_of_the_group() -> None:

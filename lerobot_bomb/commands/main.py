@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, NoReturn
 
 from lerobot_bomb import __version__
 from lerobot_bomb.checkpoints.names import check_checkpoint
@@ -26,6 +26,10 @@ class Parser(argparse.ArgumentParser):
 
     def format_help(self) -> str:
         return f"{self.opening}\n\n{super().format_help()}"
+
+    def error(self, message: str) -> NoReturn:
+        """End with one line, which argparse would print below up to twenty lines of usage."""
+        self.exit(2, f"{self.prog}: {message} (`{self.prog} --help` lists all flags)\n")
 
 
 def program_parser() -> Parser:
@@ -109,18 +113,34 @@ def _may_be_of_eval(flag: str) -> bool:
 def _parse(name: str, words: Sequence[str]) -> argparse.Namespace:
     """Read a command's flags, and check the paths of checkpoints among them."""
     parser = command_parser(name)
+    # before argparse misses the flag that is misspelt
+    _refuse(parser, _unknown_flags(parser, words))
     args, unknown = parser.parse_known_args(words)
     if "rest" in args:  # of a command that has LeRobot's parser read them
-        args.rest = long_forms(unknown)
-        unknown = [word for word in args.rest if word.startswith("--") and not _may_be_of_eval(word)]
+        args.rest, unknown = long_forms(unknown), []
+    _refuse(parser, unknown)
+    if (checkpoint := getattr(args, "policy_path", None)) is not None:
+        check_checkpoint(checkpoint)
+    return args
+
+
+def _unknown_flags(parser: Parser, words: Sequence[str]) -> list[str]:
+    """Return the flags among the words that neither the command nor LeRobot's parser reads."""
+    if any(action.nargs == argparse.REMAINDER for action in parser._actions):
+        return []
+    known = parser._option_string_actions
+    flags = [word for word in words if word.startswith("--") and word.partition("=")[0] not in {*known, "--"}]
+    if "rest" not in {*parser._defaults, *(action.dest for action in parser._actions)}:
+        return flags
+    return [flag for flag in long_forms(flags) if flag.startswith("--") and not _may_be_of_eval(flag)]
+
+
+def _refuse(parser: Parser, unknown: Sequence[str]) -> None:
     if unknown:
         from lerobot_bomb.flag_errors import nearest  # draccus: half a second
 
         near = nearest(unknown, parser._option_string_actions)
         parser.error(f"unrecognized arguments: {' '.join(unknown)}{near}")
-    if (checkpoint := getattr(args, "policy_path", None)) is not None:
-        check_checkpoint(checkpoint)
-    return args
 
 
 def _told() -> tuple[type[Exception], ...]:
