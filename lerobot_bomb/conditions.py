@@ -163,9 +163,8 @@ class AxisCondition(str):
         axis, low, high = match[1], int(match[2]), int(match[3] or match[2])
         if axis != ALL and axis not in cls.axes:
             allowed = ", ".join((*cls.axes, ALL))
-            raise ValueError(
-                f"--env.perturbations={text!r}: {axis!r} is not an axis; choose one of: {allowed}"
-            )
+            what = "several conditions, where one is needed" if axis == EACH else "not an axis"
+            raise ValueError(f"--env.perturbations={text!r}: {axis!r} is {what}; choose one of: {allowed}")
         if not 0 <= low <= high <= MAX_LEVEL:
             order = ", lowest first" if match[3] else ""
             raise ValueError(

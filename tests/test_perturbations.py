@@ -63,6 +63,7 @@ def test_all_stands_for_every_nuisance_and_no_help() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("each:3", "'each' is several conditions, where one is needed; choose one of: table, reflectance"),
         ("camra:3", "'camra' is not an axis; choose one of: table, reflectance, stones"),
         ("camera:6", "levels of camera must lie in 0..5"),
         ("camera:-1", "levels of camera must lie in 0..5"),
