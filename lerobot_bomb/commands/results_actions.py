@@ -27,6 +27,9 @@ type Envs = dict[str, dict[int, VectorEnv]]  # {group: {task id: vector env}}, a
 class LoggedVectorEnv:
     """A vector env that logs the actions of each episode when it ends; all else is the env's own.
 
+    LeRobot's ``--eval.recording`` fails on a second batch and keeps no seeds; a processor sees no end of an
+    episode.
+
     Args:
         env: a VectorEnv of B environments, or one of LeRobot's lazy ones, which are no VectorEnv.
         log: called with an episode's seed and the actions (T, D) that `env` was given.
