@@ -180,7 +180,8 @@ def check_saved_processors() -> None:
 def _keeps_statistics() -> bool:
     """Return whether a training keeps the statistics of the checkpoint that LeRobot has just loaded."""
     for policy in built_policies()[-1:]:
-        if (keeps := getattr(policy.config, "keep_statistics", None)) is False:
+        keeps = getattr(policy.config, "keep_statistics", None)
+        if keeps is False and policy.config.trained_batches:  # pyright: ignore[reportAttributeAccessIssue]
             _warn_of_new_statistics(policy.config.pretrained_path)
         return bool(keeps)
     return False
