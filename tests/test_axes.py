@@ -96,7 +96,7 @@ def test_a_pair_differs_only_in_what_its_axis_names(seed: int, axis: str, level:
         "object": ("stone_radius_m", "stone_height_m"),
     }.get(axis, ())
     assert same(nominal.layout, perturbed.layout, but=may_change)
-    assert same(nominal.layout, perturbed.layout) == ("state" not in AXES[axis].changes)
+    assert same(nominal.layout, perturbed.layout) == ("scene" not in AXES[axis].changes)
     if axis == "stones":
         np.testing.assert_array_equal(perturbed.layout.stone_xy[STONE], nominal.layout.stone_xy[STONE])
 

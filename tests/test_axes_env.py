@@ -73,7 +73,7 @@ def test_an_axis_changes_images_motion_and_instruction_only_as_it_says(under: Un
     (states, images), instruction = episode_of(env, 3), env.task_description
     perturbed_states, perturbed_images = episode_of(under(f"{axis}:5"), 3)
     changes = AXES[axis].changes
-    assert np.array_equal(states, perturbed_states) == (not {"state", "dynamics"} & set(changes))
+    assert np.array_equal(states, perturbed_states) == (not {"scene", "dynamics"} & set(changes))
     assert np.array_equal(images[0], perturbed_images[0]) == ("images" not in changes)
     assert (instruction == env.task_description) == ("instruction" not in changes)
     if changes == ("instruction",):

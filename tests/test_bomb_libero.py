@@ -194,5 +194,5 @@ def test_an_impossible_line_is_told(
 def test_the_axes_are_at_most_once_help_and_say_what_they_change() -> None:
     assert not any(axis.is_help for axis in LIBERO_AXES.values())
     assert {change for axis in LIBERO_AXES.values() for change in axis.changes} == {
-        "images", "state", "instruction", "dynamics",
+        "images", "scene", "instruction", "dynamics",
     }  # fmt: skip

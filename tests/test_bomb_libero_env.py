@@ -139,7 +139,7 @@ def test_an_axis_changes_what_it_names_and_nothing_else(env: Any, axis: str) -> 
     are_same = all(np.array_equal(nominal["pixels"][name], perturbed["pixels"][name]) for name in CAMERAS)
     assert are_same == ("images" not in changes)
     is_same_state = np.allclose(flat(nominal["robot_state"]), flat(perturbed["robot_state"]), atol=1e-12)
-    assert is_same_state == ("state" not in changes)
+    assert is_same_state == ("scene" not in changes)
 
 
 def test_nothing_is_left_of_an_episode_in_the_next(env: Any) -> None:

@@ -24,7 +24,7 @@ SEEDS = st.integers(0, 2**31)
 AXIS = st.sampled_from(list(PUSHT_AXES))
 LEVEL = st.integers(1, MAX_LEVEL)
 # what is equal in a pair unless the axis names it
-NAMED = {"pixels": "images", "agent_pos": "state", "block_pose": "state", "goal_pose": "goal"}
+NAMED = {"pixels": "images", "agent_pos": "scene", "block_pose": "scene", "goal_pose": "goal"}
 
 
 def text_of(seed: int, condition: str) -> str:
@@ -57,8 +57,8 @@ def test_physics_and_reward_change_where_the_axis_says_so(axis: str) -> None:
                 not np.array_equal(a[name], b[name]) for a, b in zip(nominal, perturbed, strict=True)
             )
         has_other_reward |= any(a["reward"] != b["reward"] for a, b in zip(nominal, perturbed, strict=True))
-    assert has_moved == bool({"dynamics", "state"} & set(changes))
-    assert has_other_reward == bool({"dynamics", "state", "goal"} & set(changes))
+    assert has_moved == bool({"dynamics", "scene"} & set(changes))
+    assert has_other_reward == bool({"dynamics", "scene", "goal"} & set(changes))
 
 
 @settings(max_examples=40, deadline=None)

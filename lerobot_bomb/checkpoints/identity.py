@@ -23,7 +23,7 @@ PROCESSOR_PATTERNS = ("policy_preprocessor*", "policy_postprocessor*")
 # fields of a config that do not change what the policy does
 NOT_ITS_SETTINGS = {
     "device", "pretrained_path", "pretrained_revision", "package_version", "use_peft", "ignore_environment",
-    "push_to_hub", "repo_id", "private", "tags", "license",
+    "push_to_hub", "repo_id", "private", "tags", "license", "keep_statistics",
 }  # fmt: skip
 
 

@@ -29,15 +29,15 @@ lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/galle
 
 - An **axis** changes one thing and leaves all others alone.
 - A **level** says how strong the change is, from 0 (none) to {MAX_LEVEL}. Colours and directions come from
-  the seed, so the levels of one seed differ only in strength.
+  the seed, so the levels of one seed differ only in strength (`language`: in form).
 - A **condition** is `none`, or one or several axes with levels: `camera:3`, `camera:2+light:3`. In
   `lerobot-eval`, a list of conditions needs brackets: `'["none","camera:3"]'`; our commands also take
   `none,camera:3`.
 - A **range** such as `camera:1-5` draws the level from the seed. Each axis of `all:1-5` draws its own
   level.
 - `{ALL}:3` is one condition: every axis at level 3, except `goal_marker`, which makes the task easier.
-- `{EACH}:3` stands for ten conditions, each of these axes alone at level 3; `{EACH}:1-5` for fifty, each
-  axis alone at each level. It works only where a list of conditions is allowed, so not in `view`.
+- `{EACH}:3` stands for ten conditions, each axis of `{ALL}` alone at level 3; `{EACH}:1-5` for fifty, each
+  axis alone at each level. `{EACH}` needs a flag that takes a list of conditions; `view` has none.
 
 Each condition is a group in `eval_info.json`, such as `place.camera-2.light-3` or `place.all-1to5`.
 Everything needed stays in view, and the instruction stays unambiguous.
