@@ -179,12 +179,12 @@ def check_saved_processors() -> None:
 
 def _keeps_statistics() -> bool:
     """Return whether a training keeps the statistics of the checkpoint that LeRobot has just loaded."""
-    for policy in built_policies()[-1:]:
-        keeps = getattr(policy.config, "keep_statistics", None)
-        if keeps is False and policy.config.trained_batches:  # pyright: ignore[reportAttributeAccessIssue]
-            _warn_of_new_statistics(policy.config.pretrained_path)
-        return bool(keeps)
-    return False
+    built = built_policies()
+    config: Any = built[-1].config if built else None
+    keeps = getattr(config, "keep_statistics", None)  # None: no policy of ours
+    if keeps is False and config.trained_batches:
+        _warn_of_new_statistics(config.pretrained_path)
+    return bool(keeps)
 
 
 @cache

@@ -132,7 +132,7 @@ def _unknown_flags(parser: Parser, words: Sequence[str]) -> list[str]:
     flags = [word for word in words if word.startswith("--") and word.partition("=")[0] not in {*known, "--"}]
     if "rest" not in {*parser._defaults, *(action.dest for action in parser._actions)}:
         return flags
-    return [flag for flag in long_forms(flags) if flag.startswith("--") and not _may_be_of_eval(flag)]
+    return [flag for flag in long_forms(flags) if not _may_be_of_eval(flag)]
 
 
 def _refuse(parser: Parser, unknown: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""Check of a saved processor, before LeRobot imports and calls the code that it names."""
+"""Check of a saved processor, before LeRobot calls the code that it names; which statistics it gets."""
 
 import re
 from collections.abc import Callable, Sequence
