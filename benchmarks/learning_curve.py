@@ -1,9 +1,8 @@
 """Learning curve of a policy: each checkpoint's results file, as a table and a plot."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
@@ -13,7 +12,6 @@ from lerobot_bomb.results.bomb import EpisodeResult, is_grounded, put_down
 from lerobot_bomb.stats import format_rate, wilson_interval
 from lerobot_bomb.tables import print_table
 
-NEAR_MM = 20.0
 LIFTED = (Stage.LIFTED, Stage.PLACED)
 
 SUCCESS, GROUNDED, LIFTED_COLOR, BAND = "#1450a0", "#288c28", "#c83c3c", "#bed7eb"
@@ -28,7 +26,6 @@ class Point:
     num_episodes: int
     num_successes: int
     num_lifted: int
-    num_near: int  # stones that were put down within NEAR_MM of the target
     num_grounded: int  # stones that were put down nearest to the target
     num_precise: int  # of these: within the tolerance
     median_error_mm: float | None  # of the stones that were put down
@@ -44,7 +41,6 @@ def count(rows: list[EpisodeResult], step: int, cpu_minutes: float) -> Point:
         num_episodes=len(rows),
         num_successes=sum(row.is_success for row in rows),
         num_lifted=sum(row.stage in LIFTED for row in rows),
-        num_near=sum(row.placement_error_mm <= NEAR_MM for row in down),
         num_grounded=len(grounded),
         num_precise=sum(row.failure != Failure.IMPRECISE for row in grounded),
         median_error_mm=median(row.placement_error_mm for row in down) if down else None,
@@ -53,16 +49,8 @@ def count(rows: list[EpisodeResult], step: int, cpu_minutes: float) -> Point:
 
 def print_points(points: dict[str, Point]) -> None:
     """Print a table of {name: point}; rates with their 95 % Wilson intervals."""
-    header = [
-        "", "training, CPU min", "success", "lifted", f"within {NEAR_MM:.0f} mm", "right intersection",
-        "precise there", "median error",
-    ]  # fmt: skip
+    header = ["", "CPU minutes", "success", "lifted", "right intersection", "precise there", "median error"]
     print_table(header, [[name, *_cells(point)] for name, point in points.items()])
-
-
-def as_figures(points: dict[str, Point]) -> dict[str, Any]:
-    """Return the points ready for JSON."""
-    return {name: asdict(point) for name, point in points.items()}
 
 
 def draw(points: list[Point], title: str, path: Path) -> None:
@@ -95,7 +83,6 @@ def _cells(point: Point) -> list[str]:
         f"{point.cpu_minutes:.1f}",
         format_rate(point.num_successes, n),
         f"{point.num_lifted}/{n}",
-        f"{point.num_near}/{n}",
         format_rate(point.num_grounded, n),
         format_rate(point.num_precise, point.num_grounded) if point.num_grounded else "-",
         "-" if error_mm is None else f"{error_mm:.1f} mm",

@@ -41,12 +41,13 @@ def parse_on_idle_machine(parser: argparse.ArgumentParser) -> argparse.Namespace
 
 
 def parse_with_policy_flags(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """Parse the command line, with --json, --force and, as args.policy_flags, flags for `lerobot-train`."""
+    """Parse the command line like parse_on_idle_machine; args.policy_flags are for `lerobot-train`."""
     add_machine_arguments(parser)
     args, args.policy_flags = parser.parse_known_args()
     unknown = [flag for flag in args.policy_flags if not re.fullmatch(r"--policy\.\w+=.*", flag)]
     if unknown:
         parser.error(f"unknown: {' '.join(unknown)}; flags for lerobot-train are --policy.NAME=VALUE")
+    require_idle_machine(args.force)
     return args
 
 

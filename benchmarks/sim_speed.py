@@ -22,16 +22,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from machine import (
-    Rows,
-    add_machine_arguments,
-    finish,
-    make_parser,
-    milliseconds,
-    positive,
-    print_rows,
-    require_idle_machine,
-)
+from machine import Rows, finish, make_parser, milliseconds, parse_on_idle_machine, positive, print_rows
 
 IMAGE_SIZE = 256
 NUM_FRAMES = 100
@@ -49,12 +40,10 @@ def main() -> None:
     parser.add_argument("--repeats", type=positive, default=3, help="processes of each (default: 3)")
     parser.add_argument("--robosuite_python", default=sys.executable, help="a Python that has robosuite")
     parser.add_argument("--measure", choices=MEASURES, help=argparse.SUPPRESS)
-    add_machine_arguments(parser)
-    args = parser.parse_args()
+    args = parse_on_idle_machine(parser)
     if args.measure:
         print(json.dumps(MEASURES[args.measure]()))
         return
-    require_idle_machine(args.force)
     os.environ.setdefault("MUJOCO_GL", "egl")
     os.environ.setdefault("PYOPENGL_PLATFORM", os.environ["MUJOCO_GL"])
 
@@ -78,7 +67,9 @@ def compare_environments(repeats: int, robosuite_python: str) -> Rows:
     runs: dict[str, list[dict[str, float]]] = {name: [] for name in pythons}
     for _ in range(repeats):
         for name, python in pythons.items():
-            output = run_in_process([python, __file__, "--measure", name], allow_failure=name in OPTIONAL)
+            output = run_in_process(
+                [python, __file__, "--force", "--measure", name], allow_failure=name in OPTIONAL
+            )
             if output is not None:
                 runs[name].append(output)
     return {

@@ -9,9 +9,8 @@ under random colours, drawn until it means something.
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from machine import add_json_argument, make_parser, positive, print_rows, write_figures
@@ -34,7 +33,7 @@ NUM_GUESSES = 60  # drawn for each verb: what it could be about
 MAX_TRIES = 200  # of colours
 COMMANDS = {"goal": goal_suite.TASKS, "long": long_suite.TASKS}
 
-type Floors = dict[str, float]
+type Floors = dict[str, float]  # {missing ability: success rate}
 
 
 def main() -> None:
@@ -44,17 +43,13 @@ def main() -> None:
     add_json_argument(parser)
     args = parser.parse_args()
     seeds = range(FIRST_SEED, FIRST_SEED + args.episodes)
-    figures = {suite: floors_of(suite)(seeds) for suite in SUITES}
+    figures = {
+        suite: floors_of_commands(suite, seeds) if suite in COMMANDS else floors_of_places(suite, seeds)
+        for suite in SUITES
+    }
     percent = {suite: {name: 100 * rate for name, rate in row.items()} for suite, row in figures.items()}
     print_rows(f"{args.episodes} episodes, %", percent)
     write_figures(args.json, figures)
-
-
-def floors_of(suite: str) -> Callable[[Sequence[int]], Floors]:
-    """Return the function from seeds to a suite's success rates, by missing ability."""
-    if suite in COMMANDS:
-        return partial(floors_of_commands, suite, COMMANDS[suite])
-    return partial(floors_of_places, suite)
 
 
 def floors_of_places(suite: str, seeds: Sequence[int]) -> Floors:
@@ -77,9 +72,9 @@ def floors_of_places(suite: str, seeds: Sequence[int]) -> Floors:
     return {name: float(np.mean(values)) for name, values in chances.items()}
 
 
-def floors_of_commands(suite: str, tasks: Sequence[Task], seeds: Sequence[int]) -> Floors:
+def floors_of_commands(suite: str, seeds: Sequence[int]) -> Floors:
     """Return the floors of a suite whose instructions are commands."""
-    rng = np.random.default_rng(0)
+    tasks, rng = COMMANDS[suite], np.random.default_rng(0)
     shares, colourless = [], []
     for seed in seeds:
         task_id, drawn, case = draw_command(tasks, EpisodeSpec(seed, suite))

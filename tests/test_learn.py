@@ -239,7 +239,7 @@ def test_a_point_counts_grounding_and_precision_apart() -> None:
     ]
     point = count(rows, step=100, cpu_minutes=2.5)
     assert (point.step, point.cpu_minutes, point.num_episodes) == (100, 2.5, 8)
-    assert (point.num_successes, point.num_lifted, point.num_near) == (2, 7, 4)
+    assert (point.num_successes, point.num_lifted) == (2, 7)
     assert (point.num_grounded, point.num_precise) == (5, 3)
     assert point.median_error_mm == 9.5  # of 1, 2, 4, 15, 22 and 45
     assert count([row("dropped", 5.0)], 1, 1.0).median_error_mm is None

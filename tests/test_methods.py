@@ -17,7 +17,7 @@ from lerobot_bomb.checkpoints.shipped import FOLDER
 from lerobot_bomb.hub.card import Checkpoint
 
 ROOT = Path(__file__).parents[1]
-COLUMN = "settings (many differ from its paper's)"
+COLUMN = "settings (many differ from the paper's)"
 SUITES = "fdvla_suites"
 
 

@@ -59,8 +59,8 @@ class Failure(FailureClass):
     )
     TIMEOUT_HOLDING = (
         "timeout_holding",
-        "time running out while both pads touched the stone or, after a lift, while one pad did or it was "
-        "still moving on the target",
+        "time running out with both pads on the stone; or, once it was lifted, with one pad on it or with "
+        "the stone still moving on the target",
     )
     LIFTED = "lifted", "a stone lifted instead of pushed (only in `goal`)"
 

@@ -28,21 +28,15 @@ lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/galle
 ```
 
 - An **axis** changes one thing and leaves all others alone.
-- A **level** says how strong the change is, from 0 (none) to {MAX_LEVEL}. Colours and directions come from
-  the seed, so the levels of one seed differ only in strength (`language`: in form).
-- A **condition** is `none`, or one or several axes with levels: `camera:3`, `camera:2+light:3`. In
-  `lerobot-eval`, a list of conditions needs brackets: `'["none","camera:3"]'`; our commands also take
-  `none,camera:3`.
-- A **range** such as `camera:1-5` draws the level from the seed. Each axis of `all:1-5` draws its own
-  level.
+- A **level** is the strength of the change, from 0 (none) to {MAX_LEVEL}; `language` has five forms instead.
+  Colours and directions depend on the seed only.
+- A **condition** is `none`, or axes with levels, such as `camera:2+light:3`. `lerobot-eval` needs brackets
+  around a list of conditions; our commands also take `none,camera:3`.
+- A **range** such as `camera:1-5` draws the level from the seed, in `all:1-5` for each axis separately.
 - `{ALL}:3` is one condition: every axis at level 3, except `goal_marker`, which makes the task easier.
-- `{EACH}:3` stands for ten conditions, each axis of `{ALL}` alone at level 3; `{EACH}:1-5` for fifty, each
-  axis alone at each level. `{EACH}` needs a flag that takes a list of conditions; `view` has none.
+- `{EACH}:3` stands for ten conditions, one for each axis of `{ALL}`; `{EACH}:1-5` for fifty.
 
-Each condition is a group in `eval_info.json`, such as `place.camera-2.light-3` or `place.all-1to5`.
-Everything needed stays in view, and the instruction stays unambiguous.
-
-The tables give the size of each level. [Axes of PushT and LIBERO](reference/axes.md).
+Columns 1 to 5 of the tables are levels. [Axes of PushT and LIBERO](reference/axes.md).
 """
 
 
@@ -94,11 +88,11 @@ def sizes_table(axis: Axis) -> list[str]:
 
 
 def _image(name: str, sheets: str) -> str:
-    return f"![{name} at its levels]({sheets}/{name}.jpg)\n"
+    return f"![{name}]({sheets}/{name}.jpg)\n"
 
 
 def _forms(instructions: list[str]) -> str:
     """Return the table of one goal, said in the form of each level."""
     rows = [(str(level), instruction) for level, instruction in enumerate(instructions)]
-    head = f"One goal, a {COLOR} stone on row {TARGET[0]}, column {TARGET[1]}, in the form of each level:"
+    head = "The instruction of one episode at each level:"
     return "\n".join(["", head, "", *markdown_table("level | instruction", rows)])
