@@ -35,6 +35,7 @@ lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/galle
 - A **range** such as `camera:1-5` draws the level from the seed, in `all:1-5` for each axis separately.
 - `{ALL}:3` is one condition: every axis at level 3, except `goal_marker`, which makes the task easier.
 - `{EACH}:3` stands for ten conditions, one for each axis of `{ALL}`; `{EACH}:1-5` for fifty.
+- A scripted expert solves every level: [its rates](benchmark.md#what-an-expert-reaches).
 
 Columns 1 to 5 of the tables are levels. [Axes of PushT and LIBERO](reference/axes.md).
 """
