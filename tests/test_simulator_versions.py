@@ -5,8 +5,8 @@ def outcome(states: str, images: str, error_mm: float = 0.31) -> Outcome:
     return {"states": 9 * states, "images": 9 * images, "successes": 9, "worst_error_mm": error_mm}
 
 
-def measured(mujoco: str, scara: Outcome, fetch: Outcome) -> Measured:
-    return {"mujoco": mujoco, "outcomes": {"scara none": scara, "fetch none": fetch}}
+def measured(version: str, scara: Outcome, fetch: Outcome) -> Measured:
+    return {"version": version, "outcomes": {"scara none": scara, "fetch none": fetch}}
 
 
 def test_the_table_marks_what_equals_the_reference() -> None:
