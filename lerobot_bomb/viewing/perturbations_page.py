@@ -29,13 +29,13 @@ lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/galle
 
 - An **axis** changes one thing and leaves all others alone.
 - A **level** is the strength of the change, from 0 (none) to {MAX_LEVEL}; `language` has five forms instead.
-  Colours and directions depend on the seed only.
+  The seed draws colours and directions, so its levels differ only in strength.
 - A **condition** is `none`, or axes with levels, such as `camera:2+light:3`. `lerobot-eval` needs brackets
   around a list of conditions; our commands also take `none,camera:3`.
 - A **range** such as `camera:1-5` draws the level from the seed, in `all:1-5` for each axis separately.
 - `{ALL}:3` is one condition: every axis at level 3, except `goal_marker`, which makes the task easier.
 - `{EACH}:3` stands for ten conditions, one for each axis of `{ALL}`; `{EACH}:1-5` for fifty.
-- A scripted expert solves every level: [its rates](benchmark.md#what-an-expert-reaches).
+- At level 5, a scripted expert still succeeds: [its rates](benchmark.md#what-an-expert-reaches).
 
 Columns 1 to 5 of the tables are levels. [Axes of PushT and LIBERO](reference/axes.md).
 """
