@@ -23,12 +23,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from machine import add_json_argument, make_parser, positive, write_figures
 
-if TYPE_CHECKING:
-    from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.episode import EpisodeSpec
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE_ROOTS = (ROOT, ROOT / "envs")
@@ -72,7 +71,6 @@ def main() -> None:
 
 def measure_here(simulator: str, num_seeds: int) -> Measured:
     """Run all cases in this process."""
-    from lerobot_bomb.bomb.episode import EpisodeSpec
     from lerobot_env_bomb.env import BombEnv
 
     env = BombEnv()
@@ -90,7 +88,7 @@ def measure_here(simulator: str, num_seeds: int) -> Measured:
     return {"version": importlib.metadata.version(simulator), "renderer": renderer, "outcomes": outcomes}
 
 
-def outcome_of(spec: "EpisodeSpec", num_seeds: int) -> Outcome:
+def outcome_of(spec: EpisodeSpec, num_seeds: int) -> Outcome:
     """Run the expert's episodes of a spec; return their hashes (SHA-256) and how they ended."""
     from lerobot_bomb.bomb.observation import PIXELS, RenderOptions
     from lerobot_bomb.envs.rollout import expert_agent, run_episode
@@ -121,7 +119,7 @@ def measure(args: argparse.Namespace, version: str) -> Measured:
     if not python.exists():
         subprocess.run(["uv", "venv", "-q", "-p", sys.executable, str(folder)], check=True)
     versions = {name: importlib.metadata.version(name) for name in PACKAGES} | {args.simulator: version}
-    pins = [f"{name}=={each}" for name, each in versions.items()] + [*NEEDED[args.simulator]]
+    pins = [*(f"{name}=={each}" for name, each in versions.items()), *NEEDED[args.simulator]]
     subprocess.run(["uv", "pip", "install", "-q", "-p", str(python), *pins], check=True)
     env = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, SOURCE_ROOTS))}
     command = [str(python), __file__, f"--simulator={args.simulator}", f"--seeds={args.seeds}"]
