@@ -33,7 +33,7 @@ ORDER = [
     "environments", "stats", "bootstrap", "smoothness", "tables", "files", "presets", "cuda_graphs",
     "bomb", "pusht", "libero", "results", "envs", "actions", "flow", "vlm", "decoding", "training", "data",
     "checkpoints", "evaluation", "viewing", "explain", "report", "hub", "policies", "serving", "harness",
-    "sweep", "commands",
+    "inspect_robots", "sweep", "commands",
 ]  # fmt: skip
 
 

@@ -150,7 +150,7 @@ def test_a_server_is_started_by_a_file_and_flags_on_this_machine_only(
     flags = ["--args.policy.num_inference_steps=3", "--port=8001"]
     model_server, host, port = started([file, *flags], monkeypatch)
     assert (host, port) == ("127.0.0.1", 8001)
-    config: Any = model_server._config
+    config: Any = model_server._policy.config
     assert (config.type, config.device, config.num_inference_steps) == ("fdvla", "cpu", 3)
 
 
@@ -260,7 +260,7 @@ def test_cameras_of_other_names_and_sizes_are_mapped_and_resized(server: Checkpo
             "64x64 pixels, and those of the camera workspace have 128x128",
         ),
         (observation(states=np.zeros(8)), "reads a state of shape (4,), and the benchmark sends (8,)"),
-        (observation(states=None), "reads a state of shape (4,), and the benchmark sends none"),
+        (observation(states=None), "sends none; many send it with observation_params"),
     ],
 )
 def test_an_observation_that_the_policy_cannot_read_is_told(

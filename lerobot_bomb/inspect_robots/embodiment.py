@@ -1,0 +1,130 @@
+"""BOMB's arm and board as an embodiment of Inspect Robots."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+from inspect_robots.embodiment import PRIVILEGED_SUCCESS, EmbodimentBase, EmbodimentInfo
+from inspect_robots.errors import EmbodimentFault
+from inspect_robots.scene import Scene
+from inspect_robots.types import Action, Observation, StepResult
+
+from lerobot_bomb import __version__
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.observation import AGENT_POS, PIXELS
+from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks, task_version
+from lerobot_bomb.checkpoints.acting import acting_config
+from lerobot_bomb.checkpoints.env_config import decode_env
+from lerobot_bomb.checkpoints.environment import check_acting_policy
+from lerobot_bomb.checkpoints.identity import policy_of_results
+from lerobot_bomb.envs.rollout import ENV_ID
+from lerobot_bomb.inspect_robots import config_errors
+from lerobot_bomb.inspect_robots.spaces import action_space, notes, observation_space
+from lerobot_bomb.inspect_robots.tasks import EPISODE
+from lerobot_bomb.results.writing import check_results_path
+
+OF_TASK = ("task", "task_ids", "perturbations")  # flags that a scene decides
+
+
+class BombEmbodiment(EmbodimentBase):
+    """Plays the scenes of BOMB's tasks: a scene is an episode, the same in every epoch.
+
+    Args:
+        flags: those of --env.type=bomb but for `depth` and those of the task, by name. Without `image_size`,
+            images have the size that the checkpoint reads which this process has loaded, else 256 pixels.
+
+    Raises:
+        ConfigError: a flag is unknown or has a value that is not allowed.
+    """
+
+    def __init__(self, **flags: Any) -> None:
+        with config_errors():
+            self._config: Any = _read_config(flags)
+        config = self._config
+        self.info = EmbodimentInfo(
+            name="bomb",
+            action_space=action_space(config.control_mode),
+            observation_space=observation_space(config.render_options.image_size),
+            control_hz=config.fps,
+            is_simulated=True,
+            capabilities=frozenset({PRIVILEGED_SUCCESS}),
+            supported_target_kinds=frozenset({EPISODE}),
+            docs=notes(config.control_mode),
+            environment_id=f"{config.simulator}, {config.robot}",
+            environment_revision=f"lerobot_policy_bomb {__version__}",
+        )
+        self._env: gymnasium.Env | None = None
+        self._spec: EpisodeSpec | None = None  # that `_env` is of
+
+    def reset(self, scene: Scene, *, seed: int | None = None) -> Observation:
+        """Start a scene's episode, whose seed is its own: `seed` changes nothing.
+
+        Raises:
+            EmbodimentFault: the scene has no episode of BOMB, no episode can be drawn from the flags, or the
+                policy that acts was trained for another environment.
+        """
+        if scene.target is None or scene.target.kind != EPISODE:
+            raise EmbodimentFault(f"scene {scene.id!r} is none of BOMB: give --task bomb/SUITE")
+        episode = scene.target.spec
+        try:
+            env = self._env_of(self._spec_of(episode))
+        except ValueError as error:
+            raise EmbodimentFault(str(error)) from None
+        observation, _ = env.reset(seed=episode["seed"])
+        return self._observe(observation)
+
+    def step(self, action: Action) -> StepResult:
+        assert self._env is not None
+        command = np.asarray(action.data, dtype=np.float32)
+        observation, reward, terminated, truncated, info = self._env.step(command)
+        reason = ("success" if info["is_success"] else info["failure"]) if terminated else None
+        return StepResult(self._observe(observation), float(reward), terminated, reason, truncated, info)
+
+    def close(self) -> None:
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+    def _spec_of(self, episode: Mapping[str, Any]) -> EpisodeSpec:
+        """Return a scene's spec, without its seed."""
+        (spec,) = self._config.specs_of(episode["suite"])
+        (spec,) = specs_of_tasks(spec, episode["task_ids"])
+        find_suite(spec.suite).check(spec)
+        return replace(spec, perturbations=episode["perturbations"])
+
+    def _env_of(self, spec: EpisodeSpec) -> gymnasium.Env:
+        if self._env is None or self._spec != spec:
+            self.close()
+            config, suite = self._config, spec.suite
+            if not config.ignore_checkpoint:
+                here = replace(config.environment, task=suite, task_version=task_version(suite))
+                check_acting_policy(here)
+            (policy,) = policy_of_results(config.results_path, 1)
+            kwargs = config.gym_kwargs | policy | {"spec": spec}
+            env_id = ENV_ID.format(suite=suite)
+            self._env, self._spec = gymnasium.make(env_id, disable_env_checker=True, **kwargs), spec
+        return self._env
+
+    def _observe(self, observation: dict[str, Any]) -> Observation:
+        assert self._env is not None
+        state = observation[AGENT_POS]
+        return Observation(
+            images=observation[PIXELS],
+            state={AGENT_POS: state, "eef_pos": state[:3], "gripper_width": state[3:]},
+            instruction=self._env.get_wrapper_attr("task_description"),
+        )
+
+
+def _read_config(flags: dict[str, Any]) -> Any:
+    """Read the config of ``--env.type=bomb`` with LeRobot's parser."""
+    for name in OF_TASK:
+        if name in flags:
+            raise ValueError(f"{name} is the task's: --task bomb/SUITE -T perturbations=..., -T task_id=...")
+    if flags.get("depth"):
+        raise ValueError("depth=true: an observation of Inspect Robots has no depth; use lerobot-eval")
+    config: Any = decode_env({"type": "bomb", **flags})
+    config.take_image_size(acting_config())
+    check_results_path(config.results_path)
+    return config
