@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import yaml
-from huggingface_hub import ModelCardData, parse_eval_result_entries
+from huggingface_hub import DatasetCard, ModelCardData, parse_eval_result_entries
 from huggingface_hub.repocard_data import model_index_to_eval_results
 from result_rows import FDVLA, read, values
 
@@ -14,6 +14,7 @@ from lerobot_bomb.commands.main import main
 from lerobot_bomb.hub.evaluations import model_index, model_index_yaml
 from lerobot_bomb.results.groups import groups_of
 from lerobot_bomb.results.origin import PolicyIdentity
+from lerobot_bomb.results.reading import read_records
 
 SUCCESSES = {("act", "none"): 8, ("act", "all:1-5"): 3, ("fdvla", "none"): 9, ("fdvla", "all:1-5"): 0}
 N = 10
@@ -184,3 +185,17 @@ def test_rates_of_several_suites_stay_apart() -> None:
     index = yaml.safe_load(model_index_yaml("x", groups_of(map(read, rows))))["model-index"]
     _, results = model_index_to_eval_results(index)
     assert {each.dataset_config: each.metric_value for each in results} == {"place.none": 1, "object.none": 0}
+
+
+def test_the_benchmark_s_dataset_names_the_tasks_of_the_results(exported: Path) -> None:
+    folder = exported / "benchmark"
+    evaluation = yaml.safe_load((folder / "eval.yaml").read_text())
+    tasks = {each["id"] for each in evaluation["tasks"]}
+    results = yaml.safe_load((folder_of(exported, "act") / ".eval_results" / "lerobot_bomb.yaml").read_text())
+    assert tasks == {entry["dataset"]["task_id"] for entry in results}
+    (config,) = DatasetCard((folder / "README.md").read_text()).data.to_dict()["configs"]
+    (files,) = config["data_files"]
+    assert {(each["config"], each["split"]) for each in evaluation["tasks"]} == {
+        (config["config_name"], files["split"])
+    }
+    assert read_records(folder / files["path"]) == read_records(exported.parent / "r.jsonl")

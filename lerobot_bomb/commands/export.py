@@ -11,6 +11,7 @@ from lerobot_bomb.report.latex import latex_tables
 from lerobot_bomb.results.groups import groups_of, policies_of
 
 LATEX, MODEL_INDEX, EVAL_RESULTS = "table.tex", "model-index.yaml", ".eval_results/lerobot_bomb.yaml"
+BENCHMARK = "benchmark"  # folder of the benchmark's own files
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--benchmark_id",
         type=_hub_id,
         metavar="USER/NAME",
-        help=f"the benchmark's dataset on the Hub, which {EVAL_RESULTS} must name (default: no such file)",
+        help=f"the benchmark's dataset on the Hub, which {EVAL_RESULTS} must name; its own files go into "
+        f"{BENCHMARK}/ (default: no such files)",
     )
 
 
@@ -38,18 +40,22 @@ def _hub_id(text: str) -> str:
 def run(args: argparse.Namespace) -> int:
     """Write LaTeX tables and, for each policy, the files of its Hub repository; print the paths."""
     # huggingface_hub takes a second
+    from lerobot_bomb.hub.benchmark import benchmark_files
     from lerobot_bomb.hub.evaluations import check_one_rate_each, eval_results_yaml, model_index_yaml
 
     records = [record for path in args.paths for record in read_undamaged(path).records]
     groups = groups_of(records, names_of(args.names, records))
     contents = {args.output / LATEX: latex_tables(groups)}
     policies = policies_of(groups)
-    _, *names = file_names([LATEX, *(each.short_name for each in policies)])
+    _, _, *names = file_names([LATEX, BENCHMARK, *(each.short_name for each in policies)])
     for name, policy in zip(names, policies, strict=True):
         check_one_rate_each(policy.groups)
         contents[args.output / name / MODEL_INDEX] = model_index_yaml(name, policy.groups)
         if args.benchmark_id is not None:
             contents[args.output / name / EVAL_RESULTS] = eval_results_yaml(args.benchmark_id, policy.groups)
+    if args.benchmark_id is not None:
+        files = benchmark_files(args.benchmark_id, groups, records)
+        contents |= {args.output / BENCHMARK / name: content for name, content in files.items()}
     check_outputs(args.paths, contents)
     for path, content in contents.items():
         with written_whole(path) as (unfinished,):

@@ -1,6 +1,6 @@
 """Evaluations in the Hub's own formats: a model card's `model-index`, and `.eval_results/*.yaml`."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import yaml
@@ -36,7 +36,7 @@ def model_index(groups: list[Group]) -> list[EvalResult]:
 def model_index_yaml(model_name: str, groups: list[Group]) -> str:
     """Write `model_index` as YAML: the key `model-index` of a model card's metadata."""
     index = eval_results_to_model_index(model_name, model_index(groups))
-    return _yaml({"model-index": index})
+    return as_yaml({"model-index": index})
 
 
 def eval_results_yaml(benchmark_id: str, groups: list[Group]) -> str:
@@ -50,7 +50,12 @@ def eval_results_yaml(benchmark_id: str, groups: list[Group]) -> str:
         )
         for group, condition, records in _conditions(groups)
     ]
-    return _yaml(eval_result_entries_to_yaml(entries))
+    return as_yaml(eval_result_entries_to_yaml(entries))
+
+
+def task_ids_of(groups: Iterable[Group]) -> list[str]:
+    """Return the names of suites under conditions, as `place.camera-3`, each once."""
+    return [*dict.fromkeys(_config(condition, records) for _, condition, records in _conditions(groups))]
 
 
 def check_one_rate_each(groups: list[Group]) -> None:
@@ -65,7 +70,7 @@ def check_one_rate_each(groups: list[Group]) -> None:
             )
 
 
-def _conditions(groups: list[Group]) -> Iterator[tuple[Group, AxisCondition, list[Record]]]:
+def _conditions(groups: Iterable[Group]) -> Iterator[tuple[Group, AxisCondition, list[Record]]]:
     for group in groups:
         for condition, records in by_condition(group.records).items():
             yield group, condition, records
@@ -91,5 +96,6 @@ def _counted(records: list[Record]) -> str:
     return str(rate_of(records))
 
 
-def _yaml(values: Any) -> str:
+def as_yaml(values: Any) -> str:
+    """Write values as YAML, a line each."""
     return yaml.safe_dump(values, sort_keys=False, allow_unicode=True, width=1000)
