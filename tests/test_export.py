@@ -10,6 +10,7 @@ from huggingface_hub import DatasetCard, ModelCardData, parse_eval_result_entrie
 from huggingface_hub.repocard_data import model_index_to_eval_results
 from result_rows import FDVLA, read, values
 
+from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.hub.evaluations import model_index, model_index_yaml
 from lerobot_bomb.results.groups import groups_of
@@ -199,3 +200,17 @@ def test_the_benchmark_s_dataset_names_the_tasks_of_the_results(exported: Path) 
         (config["config_name"], files["split"])
     }
     assert read_records(folder / files["path"]) == read_records(exported.parent / "r.jsonl")
+
+
+def test_tools_that_pair_by_seed_get_each_episode_and_what_it_is_of(
+    exported: Path, rows: list[dict[str, Any]]
+) -> None:
+    folder = exported.parent / "paired"
+    assert main(["export", str(exported.parent / "r.jsonl"), f"--output={folder}", "--eval_info"]) == 0
+    for (policy, condition), successes in SUCCESSES.items():
+        run = folder_of(folder, policy) / f"place.{Condition(condition).key}"
+        info, meta = (json.loads((run / name).read_text()) for name in ("eval_info.json", "run_meta.json"))
+        assert [(each["seed"], each["success"]) for each in info["per_episode"]] == [
+            (seed, seed < successes) for seed in range(N)
+        ]
+        assert (meta["task"], meta["environment"], meta["policy_family"]) == (run.name, "bomb", policy)

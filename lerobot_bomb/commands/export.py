@@ -3,10 +3,11 @@
 import argparse
 from pathlib import Path
 
-from lerobot_bomb.commands.arguments import add_names_flag, path_flag
+from lerobot_bomb.commands.arguments import add_names_flag, path_flag, switch
 from lerobot_bomb.commands.results_files import check_outputs, names_of, read_undamaged
 from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.files import file_names, written_whole
+from lerobot_bomb.report.eval_info import eval_info_files
 from lerobot_bomb.report.latex import latex_tables
 from lerobot_bomb.results.groups import groups_of, policies_of
 
@@ -27,6 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"the benchmark's dataset on the Hub, which {EVAL_RESULTS} must name; its own files go into "
         f"{BENCHMARK}/ (default: no such files)",
     )
+    about = "also write eval_info.json with seeds and run_meta.json, for tools that pair episodes"
+    add("--eval_info", **switch(), help=about)
 
 
 def _hub_id(text: str) -> str:
@@ -51,6 +54,9 @@ def run(args: argparse.Namespace) -> int:
     for name, policy in zip(names, policies, strict=True):
         check_one_rate_each(policy.groups)
         contents[args.output / name / MODEL_INDEX] = model_index_yaml(name, policy.groups)
+        if args.eval_info:
+            files = eval_info_files(policy.groups)
+            contents |= {args.output / name / path: content for path, content in files.items()}
         if args.benchmark_id is not None:
             contents[args.output / name / EVAL_RESULTS] = eval_results_yaml(args.benchmark_id, policy.groups)
     if args.benchmark_id is not None:

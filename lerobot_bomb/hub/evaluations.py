@@ -8,8 +8,14 @@ from huggingface_hub import EvalResult, EvalResultEntry, eval_result_entries_to_
 from huggingface_hub.repocard_data import eval_results_to_model_index
 
 from lerobot_bomb.conditions import AxisCondition
-from lerobot_bomb.hub.rates import suite_or_task
-from lerobot_bomb.results.groups import Group, by_condition, differing, rate_of
+from lerobot_bomb.results.groups import (
+    Group,
+    by_condition,
+    condition_key,
+    differing,
+    rate_of,
+    suite_or_task,
+)
 from lerobot_bomb.results.record import Record
 
 METRIC = "success_rate"  # a share, 0..1
@@ -23,7 +29,9 @@ def model_index(groups: list[Group]) -> list[EvalResult]:
             task_name=suite_or_task(records[0]),
             dataset_type=group.record_type.env_type,
             dataset_name=group.records[0].benchmark(),
-            dataset_config=_config(condition, records),  # tells results apart, which their task does not
+            dataset_config=condition_key(
+                records[0], condition
+            ),  # tells results apart, which their task does not
             metric_type=METRIC,
             metric_name="success rate",
             metric_value=_share(records),
@@ -44,7 +52,7 @@ def eval_results_yaml(benchmark_id: str, groups: list[Group]) -> str:
     entries = [
         EvalResultEntry(
             dataset_id=benchmark_id,
-            task_id=_config(condition, records),
+            task_id=condition_key(records[0], condition),
             value=_share(records),
             notes=f"{_counted(records)}; {group.lines()[1]}",
         )
@@ -55,7 +63,9 @@ def eval_results_yaml(benchmark_id: str, groups: list[Group]) -> str:
 
 def task_ids_of(groups: Iterable[Group]) -> list[str]:
     """Return the names of suites under conditions, as `place.camera-3`, each once."""
-    return [*dict.fromkeys(_config(condition, records) for _, condition, records in _conditions(groups))]
+    return [
+        *dict.fromkeys(condition_key(records[0], condition) for _, condition, records in _conditions(groups))
+    ]
 
 
 def check_one_rate_each(groups: list[Group]) -> None:
@@ -74,11 +84,6 @@ def _conditions(groups: Iterable[Group]) -> Iterator[tuple[Group, AxisCondition,
     for group in groups:
         for condition, records in by_condition(group.records).items():
             yield group, condition, records
-
-
-def _config(condition: AxisCondition, records: list[Record]) -> str:
-    """Return the task and condition as `place.camera-3`."""
-    return f"{suite_or_task(records[0])}.{condition.key}"
 
 
 def _share(records: list[Record]) -> float:

@@ -7,8 +7,7 @@ from lerobot_bomb.hub.markdown import code, plain
 from lerobot_bomb.report.chart import Chart
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.sections import answer
-from lerobot_bomb.results.groups import Group, by_condition, rate_of
-from lerobot_bomb.results.record import Record
+from lerobot_bomb.results.groups import Group, by_condition, rate_of, suite_or_task
 from lerobot_bomb.results.summary import named_counts, summarise
 from lerobot_bomb.stats import Rate
 
@@ -82,11 +81,6 @@ def mostly_failing(groups: Sequence[Group]) -> list[str]:
         for name, rate in rates_of(group).items()
         if 2 * rate.successes < rate.n
     ]
-
-
-def suite_or_task(record: Record) -> str:
-    """Return the suite of an episode, or its task where the environment has no suites."""
-    return getattr(record.spec, "suite", None) or record.tasks[0]
 
 
 def _title(group: Group) -> str:

@@ -71,6 +71,16 @@ class Group:
         return " and ".join(sorted({getattr(each, key) or NOT_RECORDED for each in self.records}))
 
 
+def suite_or_task(record: Record) -> str:
+    """Return the suite of an episode, or its task where the environment has no suites."""
+    return getattr(record.spec, "suite", None) or record.tasks[0]
+
+
+def condition_key(record: Record, condition: AxisCondition) -> str:
+    """Name a record's suite under a condition, as `place.camera-3`."""
+    return f"{suite_or_task(record)}.{condition.key}"
+
+
 @dataclass(frozen=True)
 class Policy:
     """Groups of one policy, with a short name that is unique among the policies beside it."""
