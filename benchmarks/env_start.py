@@ -3,7 +3,7 @@
 LeRobot is imported at the top, as the script of ``lerobot-eval`` does: multiprocessing repeats the
 imports of the main script in every child unless somebody prevents it.
 
-    python benchmarks/env_start.py ours|default
+    python benchmarks/env_start.py ours|default|sapien
 """
 
 import json
@@ -19,8 +19,9 @@ NUM_ENVS = 2
 
 def main() -> None:
     """Print {"seconds": ...} as the last line."""
-    config = BombEnvConfig()
-    create_envs = {"ours": BombEnvConfig.create_envs, "default": EnvConfig.create_envs}[sys.argv[1]]
+    path = sys.argv[1]
+    config = BombEnvConfig(simulator="sapien" if path == "sapien" else "mujoco")
+    create_envs = EnvConfig.create_envs if path == "default" else BombEnvConfig.create_envs
     started = time.perf_counter()
     suites = create_envs(config, NUM_ENVS, use_async_envs=True)
     env = next(iter(next(iter(suites.values())).values()))

@@ -22,6 +22,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from machine import Rows, finish, make_parser, milliseconds, parse_on_idle_machine, positive, print_rows
 
 IMAGE_SIZE = 256
@@ -55,7 +56,7 @@ def main() -> None:
     figures = {
         "milliseconds": medians,
         "steps_per_s": {number: statistics.median(runs) for number, runs in rates.items()},
-        "start_s": {path: start_seconds(path, args.repeats) for path in ("ours", "default")},
+        "start_s": {path: start_seconds(path, args.repeats) for path in ("ours", "default", "sapien")},
     }
     report(figures)
     finish(args.json, figures, bars(figures))
@@ -115,13 +116,17 @@ def make_bomb(simulator: str = "mujoco", render_preset: str = "fast"):
 
 
 def measure_bomb(simulator: str = "mujoco", render_preset: str = "fast") -> dict[str, float]:
-    """Milliseconds of one camera's frame, and of a step with its two cameras."""
+    """Milliseconds of one camera's frame, of a step with its two cameras, and of its physics alone."""
+    from lerobot_bomb.bomb.episode import DEFAULT_FPS, PHYSICS_HZ
+
     env = make_bomb(simulator, render_preset)
     draw = env.get_wrapper_attr("_draw")  # render() composes an image for people
     lift = [0.0, 0.0, 0.2, 1.0]
+    scene, above = env.get_wrapper_attr("_run").scene, np.array([0.0, 0.0, 0.1])
     return {
         "frame": median_ms(lambda: draw("workspace", IMAGE_SIZE), NUM_FRAMES),
         "step": median_ms(lambda: env.step(lift), NUM_STEPS),
+        "physics": median_ms(lambda: scene.move(above, True, PHYSICS_HZ // DEFAULT_FPS), NUM_STEPS),
     }
 
 
@@ -138,7 +143,6 @@ def measure_fetch() -> dict[str, float]:
 
 def measure_lift() -> dict[str, float]:
     """Milliseconds of one camera's frame, and of a step with two cameras."""
-    import numpy as np
     import robosuite  # pyright: ignore[reportMissingImports]
 
     env = robosuite.make(
@@ -215,7 +219,10 @@ def report(figures: dict) -> None:
         print("lift was not measured; see --help for how to install robosuite")
     rate, start = figures["steps_per_s"], figures["start_s"]
     print(f"steps/s with two cameras: {rate['1']:.0f} in one process, {rate['2']:.0f} in two")
-    print(f"start of two workers: ours {start['ours']:.2f} s, LeRobot's default {start['default']:.2f} s")
+    print(
+        f"start of two workers: ours {start['ours']:.2f} s, with SAPIEN {start['sapien']:.2f} s, "
+        f"LeRobot's default {start['default']:.2f} s"
+    )
 
 
 def bars(figures: dict) -> dict[str, bool]:
