@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,11 @@ from inspect_robots.types import Action
 
 from lerobot_bomb.bomb.suites import OWN_SUITES
 from lerobot_bomb.checkpoints.acting import acting
+from lerobot_bomb.inspect_robots import embodiment as embodiment_module
 from lerobot_bomb.inspect_robots.embodiment import BombEmbodiment
 from lerobot_bomb.inspect_robots.policy import CheckpointPolicy
 from lerobot_bomb.inspect_robots.tasks import make_task
+from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_bomb.results.record import MEASURED
 
 SMALL = {"image_size": 64}
@@ -97,6 +100,45 @@ def test_the_environment_ends_the_episode_when_the_task_does() -> None:
     results = [embodiment.step(Action(np.array([0.0, 0.0, 0.0, 1.0]))) for _ in range(max_steps)]
     embodiment.close()
     assert [result.truncated for result in results] == [False] * (max_steps - 1) + [True]
+
+
+def test_records_name_the_policy_that_acts_now(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    embodiment = BombEmbodiment(results_path=str(tmp_path / "r.jsonl"), **SMALL)
+    (scene,) = make_task("place", episodes=1).scenes
+    for number, name in enumerate(("act", "fdvla")):
+        known = [{"policy": PolicyIdentity(name)}]
+        monkeypatch.setattr(embodiment_module, "policy_of_results", lambda *_, known=known: known)
+        embodiment.reset(scene, seed=number)
+        while not embodiment.step(Action(np.array([0.0, 0.0, 0.0, 1.0]))).truncated:
+            pass
+    embodiment.close()
+    assert [each["policy"]["type"] for each in records_of(tmp_path / "r.jsonl")] == ["act", "fdvla"]
+
+
+def test_every_policy_that_acts_is_checked(policy: CheckpointPolicy) -> None:
+    config: Any = policy._policy.config
+    elsewhere = replace(config, environment=replace(config.environment, task="spatial"))
+    embodiment = BombEmbodiment(**SMALL)
+    (scene,) = make_task("place", episodes=1).scenes
+    with acting(config):
+        embodiment.reset(scene)
+    with acting(elsewhere), pytest.raises(EmbodimentFault, match="trained for an environment with task=spat"):
+        embodiment.reset(scene)
+    embodiment.close()
+
+
+def test_a_second_epoch_of_records_is_refused(tmp_path: Path) -> None:
+    (scene,) = make_task("place", episodes=1).scenes
+    for flags in ({}, {"results_path": str(tmp_path / "r.jsonl")}):
+        embodiment = BombEmbodiment(**flags, **SMALL)
+        for seed in (1, 1):  # a trial that is tried again is the same epoch
+            embodiment.reset(scene, seed=seed)
+        if flags:
+            with pytest.raises(EmbodimentFault, match="second epoch"):
+                embodiment.reset(scene, seed=2)
+        else:
+            embodiment.reset(scene, seed=2)
+        embodiment.close()
 
 
 def test_images_have_the_size_that_the_acting_checkpoint_reads(policy: CheckpointPolicy) -> None:

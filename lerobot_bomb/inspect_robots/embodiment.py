@@ -23,6 +23,7 @@ from lerobot_bomb.envs.rollout import ENV_ID
 from lerobot_bomb.inspect_robots import config_errors
 from lerobot_bomb.inspect_robots.spaces import action_space, notes, observation_space
 from lerobot_bomb.inspect_robots.tasks import EPISODE
+from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_bomb.results.writing import check_results_path
 
 OF_TASK = ("task", "task_ids", "perturbations")  # flags that a scene decides
@@ -56,14 +57,16 @@ class BombEmbodiment(EmbodimentBase):
             environment_revision=f"lerobot_policy_bomb {__version__}",
         )
         self._env: gymnasium.Env | None = None
-        self._spec: EpisodeSpec | None = None  # that `_env` is of
+        self._made_for: tuple[EpisodeSpec, dict[str, PolicyIdentity]] | None = None  # what `_env` is of
+        self._trial: tuple[gymnasium.Env, int, int | None] | None = None  # env, episode's seed, trial's seed
 
     def reset(self, scene: Scene, *, seed: int | None = None) -> Observation:
         """Start a scene's episode, whose seed is its own: `seed` changes nothing.
 
         Raises:
-            EmbodimentFault: the scene has no episode of BOMB, no episode can be drawn from the flags, or the
-                policy that acts was trained for another environment.
+            EmbodimentFault: the scene has no episode of BOMB, no episode can be drawn from the flags, the
+                policy that acts was trained for another environment, or a second epoch would replace the
+                records of the first.
         """
         if scene.target is None or scene.target.kind != EPISODE:
             raise EmbodimentFault(f"scene {scene.id!r} is none of BOMB: give --task bomb/SUITE")
@@ -72,6 +75,7 @@ class BombEmbodiment(EmbodimentBase):
             env = self._env_of(self._spec_of(episode))
         except ValueError as error:
             raise EmbodimentFault(str(error)) from None
+        self._begin_trial(scene, (env, episode["seed"], seed))
         observation, _ = env.reset(seed=episode["seed"])
         return self._observe(observation)
 
@@ -95,17 +99,27 @@ class BombEmbodiment(EmbodimentBase):
         return replace(spec, perturbations=episode["perturbations"])
 
     def _env_of(self, spec: EpisodeSpec) -> gymnasium.Env:
-        if self._env is None or self._spec != spec:
+        """Return the environment of a spec, which names the policy that acts now in its records."""
+        config, suite = self._config, spec.suite
+        if not config.ignore_checkpoint:
+            check_acting_policy(replace(config.environment, task=suite, task_version=task_version(suite)))
+        (policy,) = policy_of_results(config.results_path, 1)
+        if self._env is None or self._made_for != (spec, policy):
             self.close()
-            config, suite = self._config, spec.suite
-            if not config.ignore_checkpoint:
-                here = replace(config.environment, task=suite, task_version=task_version(suite))
-                check_acting_policy(here)
-            (policy,) = policy_of_results(config.results_path, 1)
             kwargs = config.gym_kwargs | policy | {"spec": spec}
-            env_id = ENV_ID.format(suite=suite)
-            self._env, self._spec = gymnasium.make(env_id, disable_env_checker=True, **kwargs), spec
+            self._env = gymnasium.make(ENV_ID.format(suite=suite), disable_env_checker=True, **kwargs)
+            self._made_for = spec, policy
         return self._env
+
+    def _begin_trial(self, scene: Scene, trial: tuple[gymnasium.Env, int, int | None]) -> None:
+        """Note a trial; refuse an epoch after the first, whose seed alone differs, if records are kept."""
+        before, self._trial = self._trial, trial
+        path = self._config.results_path
+        if path is not None and before is not None and before[:2] == trial[:2] and before != trial:
+            raise EmbodimentFault(
+                f"scene {scene.id!r} in a second epoch: of an episode that is run again, only the last "
+                f"record in {path} counts; use --epochs=1 and more episodes, or leave out -E results_path"
+            )
 
     def _observe(self, observation: dict[str, Any]) -> Observation:
         assert self._env is not None
