@@ -214,3 +214,21 @@ def test_tools_that_pair_by_seed_get_each_episode_and_what_it_is_of(
             (seed, seed < successes) for seed in range(N)
         ]
         assert (meta["task"], meta["environment"], meta["policy_family"]) == (run.name, "bomb", policy)
+
+
+def test_numbered_tasks_are_exported_apart(tmp_path: Path) -> None:
+    rows = [
+        values(seed, None if task_id else "dropped", spec={"suite": "object", "task_id": task_id})
+        for task_id in (0, 3)
+        for seed in range(2)
+    ]
+    (tmp_path / "r.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert main(["export", str(tmp_path / "r.jsonl"), f"--output={tmp_path / 'out'}", "--eval_info"]) == 0
+    for task, success in ((0, False), (3, True)):
+        folder = tmp_path / "out" / "act" / f"object.none.task-{task}"
+        info, meta = (json.loads((folder / name).read_text()) for name in ("eval_info.json", "run_meta.json"))
+        assert [(each["seed"], each["success"]) for each in info["per_episode"]] == [
+            (0, success),
+            (1, success),
+        ]
+        assert meta["task"] == folder.name

@@ -166,14 +166,12 @@ leave_out_of_help(Environment, [each.name for each in fields(Environment)])
 
 
 def numbered_tasks(specs: Iterable[Mapping[str, Any]]) -> tuple[int, ...]:
-    """Numbers of the episodes' tasks; empty if each episode draws its task.
-
-    A spec gives its task by number, or by a target and a colour.
-    """
-    ids = {_task_id(spec) for spec in specs}
+    """Numbers of the episodes' tasks; empty if each episode draws its task."""
+    ids = {numbered_task(spec) for spec in specs}
     return tuple(sorted(number for number in ids if number is not None)) if None not in ids else ()
 
 
-def _task_id(spec: Mapping[str, Any]) -> int | None:
+def numbered_task(spec: Mapping[str, Any]) -> int | None:
+    """Return the number of the task that a spec gives, or the one of its target and colour; None: drawn."""
     target, color = spec.get("target"), spec.get("color")
     return task_id(target, color) if target and color else spec.get("task_id")

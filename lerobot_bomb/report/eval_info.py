@@ -4,14 +4,14 @@ import json
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from lerobot_bomb.results.groups import Group, by_condition, condition_key, rate_of
+from lerobot_bomb.results.groups import Group, by_condition, by_task, condition_key, rate_of
 from lerobot_bomb.results.record import Record
 
 EVAL_INFO, RUN_META = "eval_info.json", "run_meta.json"
 
 
 def eval_info_files(groups: Iterable[Group]) -> dict[str, str]:
-    """Return {path: content} of a policy's two files for each suite and condition.
+    """Return {path: content} of a policy's two files for each suite, condition and numbered task.
 
     LeRobot's own eval_info.json names no seeds; the layout with seeds is that of its releases before 0.4.
     run_meta.json says what was evaluated, by the names that `arisole evaluate` reads.
@@ -19,9 +19,10 @@ def eval_info_files(groups: Iterable[Group]) -> dict[str, str]:
     files = {}
     for group in groups:
         for condition, records in by_condition(group.records).items():
-            task = condition_key(records[0], condition)
-            files[f"{task}/{EVAL_INFO}"] = _json(_eval_info(records))
-            files[f"{task}/{RUN_META}"] = _json(_run_meta(task, records[0]))
+            for number, episodes in by_task(records).items():
+                task = condition_key(records[0], condition) + ("" if number is None else f".task-{number}")
+                files[f"{task}/{EVAL_INFO}"] = _json(_eval_info(episodes))
+                files[f"{task}/{RUN_META}"] = _json(_run_meta(task, episodes[0]))
     return files
 
 
@@ -34,7 +35,7 @@ def _eval_info(records: Sequence[Record]) -> dict[str, Any]:
             "success": record.is_success,
             "seed": record.spec.seed,
         }
-        for number, record in enumerate(sorted(records, key=lambda each: (each.tasks, each.spec.seed)))
+        for number, record in enumerate(sorted(records, key=lambda each: each.spec.seed))
     ]
     return {"per_episode": episodes, "aggregated": {"pc_success": 100 * rate_of(records).share}}
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
 
+from lerobot_bomb.bomb.environment import numbered_task
 from lerobot_bomb.conditions import NONE, AxisCondition
 from lerobot_bomb.results.names import numbered, policy_key, policy_names
 from lerobot_bomb.results.origin import NOT_RECORDED
@@ -188,6 +189,14 @@ def by_condition[R: Record](records: Iterable[R]) -> dict[AxisCondition, list[R]
     for record in records:
         conditions.setdefault(record.spec.condition, []).append(record)
     return conditions
+
+
+def by_task[R: Record](records: Iterable[R]) -> dict[int | None, list[R]]:
+    """Split records by the number of their task; None: each episode draws its own, or there is but one."""
+    tasks: dict[int | None, list[R]] = {}
+    for record in records:
+        tasks.setdefault(numbered_task(vars(record.spec)), []).append(record)
+    return tasks
 
 
 def rate_of[R: Record](
