@@ -232,3 +232,17 @@ def test_numbered_tasks_are_exported_apart(tmp_path: Path) -> None:
             (1, success),
         ]
         assert meta["task"] == folder.name
+
+
+@pytest.mark.parametrize("flag", ["--eval_info", "--benchmark_id=me/bomb"])
+def test_policies_that_must_not_be_compared_are_refused(
+    flag: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hard = {"split": "heldout", "success_tolerance_mm": 20.0}
+    rows = [values(0), values(0, policy=FDVLA, spec=hard)]
+    (tmp_path / "r.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert main(["export", str(tmp_path / "r.jsonl"), f"--output={tmp_path / 'out'}"]) == 0
+    assert main(["export", str(tmp_path / "r.jsonl"), f"--output={tmp_path / 'out'}", flag]) == 1
+    assert "place.none of act and fdvla must not be compared: the episodes differ in split, succ" in (
+        capsys.readouterr().err
+    )

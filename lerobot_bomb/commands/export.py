@@ -44,15 +44,23 @@ def run(args: argparse.Namespace) -> int:
     """Write LaTeX tables and, for each policy, the files of its Hub repository; print the paths."""
     # huggingface_hub takes a second
     from lerobot_bomb.hub.benchmark import benchmark_files
-    from lerobot_bomb.hub.evaluations import check_one_rate_each, eval_results_yaml, model_index_yaml
+    from lerobot_bomb.hub.evaluations import (
+        check_comparable,
+        check_one_rate_each,
+        eval_results_yaml,
+        model_index_yaml,
+    )
 
     records = [record for path in args.paths for record in read_undamaged(path).records]
     groups = groups_of(records, names_of(args.names, records))
     contents = {args.output / LATEX: latex_tables(groups)}
     policies = policies_of(groups)
     _, _, *names = file_names([LATEX, BENCHMARK, *(each.short_name for each in policies)])
-    for name, policy in zip(names, policies, strict=True):
+    for policy in policies:
         check_one_rate_each(policy.groups)
+    if args.eval_info or args.benchmark_id is not None:
+        check_comparable(groups)
+    for name, policy in zip(names, policies, strict=True):
         contents[args.output / name / MODEL_INDEX] = model_index_yaml(name, policy.groups)
         if args.eval_info:
             files = eval_info_files(policy.groups)

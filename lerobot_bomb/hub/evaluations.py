@@ -8,6 +8,7 @@ from huggingface_hub import EvalResult, EvalResultEntry, eval_result_entries_to_
 from huggingface_hub.repocard_data import eval_results_to_model_index
 
 from lerobot_bomb.conditions import AxisCondition
+from lerobot_bomb.results.comparison import kept_apart
 from lerobot_bomb.results.groups import (
     Group,
     by_condition,
@@ -78,6 +79,21 @@ def check_one_rate_each(groups: list[Group]) -> None:
                 f"{records[0].describe_policy()} has two rates for {suite_or_task(records[0])}, {condition}: "
                 f"the episodes differ in {', '.join(differing([other, group]))}; export the records of one"
             )
+
+
+def check_comparable(groups: Iterable[Group]) -> None:
+    """Raise a ValueError if policies have rates of one name, of episodes that must not be compared."""
+    earlier: dict[str, list[Group]] = {}
+    for group, condition, records in _conditions(groups):
+        name = condition_key(records[0], condition)
+        others = earlier.setdefault(name, [])
+        for other in others:
+            if apart := kept_apart(other, group):
+                raise ValueError(
+                    f"{name} of {other.policy} and {group.policy} must not be compared: the episodes differ "
+                    f"in {', '.join(apart)}; export each by itself, to its own --output"
+                )
+        others.append(group)
 
 
 def _conditions(groups: Iterable[Group]) -> Iterator[tuple[Group, AxisCondition, list[Record]]]:

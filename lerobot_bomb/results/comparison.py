@@ -105,7 +105,12 @@ def have_pairs(first: Group, second: Group) -> bool:
 
 def can_compare(first: Group, second: Group, across: Collection[str] = ()) -> bool:
     """Return True if two groups differ in nothing but policy and these settings, as far as records say."""
-    return not _apart(_values_of([first]), _values_of([second]), across)
+    return not kept_apart(first, second, across)
+
+
+def kept_apart(first: Group, second: Group, across: Collection[str] = ()) -> list[str]:
+    """Return the settings, but policy and these, in which two groups differ, as far as records say."""
+    return _apart(_values_of([first]), _values_of([second]), across)
 
 
 def compare(
