@@ -14,6 +14,8 @@ from scipy.stats import linregress
 
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.report.cells import points
+from lerobot_bomb.report.sections.run import commands
+from lerobot_bomb.results.groups import groups_of
 from lerobot_bomb.results.pairs import compare_pairs
 
 CLASSES = (None, None, None, "imprecise", "wrong_intersection", "dropped")
@@ -313,3 +315,11 @@ def test_the_command_that_is_given_runs_the_same_again(rows: Rows, written: Path
         assert flags["--seed"] == "0" and flags["--eval.n_episodes"] == "12"
         assert json.loads(flags["--env.perturbations"]) == ["none", "camera:2", "camera:4"]
         assert any(name in flags for name in ("--policy.path", "--policy.type"))
+
+
+def test_its_number_of_episodes_is_per_task() -> None:
+    rows = [
+        values(seed, spec={"suite": "object", "task_id": task_id}) for task_id in (0, 3) for seed in range(3)
+    ]
+    (group,) = groups_of(map(read, rows))
+    assert "--eval.n_episodes=3" in shlex.split(commands(group)[-1])

@@ -252,7 +252,8 @@ class EpisodeResult(Record):
     @classmethod
     def eval_flags(cls, records: Sequence[Self]) -> list[str]:
         """Return lerobot-eval's flags for the environment and the tasks of an evaluation."""
-        return [*records[0].environment().eval_flags(), *_task_flags([each.spec for each in records])]
+        first, specs = records[0], [each.spec for each in records]
+        return [*first.environment().eval_flags(), *_changed_flags(first), *_task_flags(specs)]
 
     @classmethod
     def describe_change(cls, pairs: Sequence[tuple[Self, Self]]) -> str:
@@ -270,6 +271,17 @@ class EpisodeResult(Record):
 def _number(record: EpisodeResult) -> int:
     """Return the number of the task of an episode of `place`."""
     return task_id(record.target or (), record.color or "")
+
+
+def _changed_flags(record: EpisodeResult) -> list[str]:
+    """Return the flags of settings that no training fixes, where they are not the default."""
+    recorded = vars(record.spec) | {"render_preset": record.render_preset}
+    default = {**vars(EpisodeSpec), "render_preset": RenderOptions.preset}
+    return [
+        f"--env.{name}={recorded[name]}"
+        for name in ("split", "success_tolerance_mm", "simulator", "render_preset")
+        if recorded[name] not in (default[name], NOT_RECORDED)
+    ]
 
 
 def _task_flags(specs: Sequence[EpisodeSpec]) -> list[str]:

@@ -10,7 +10,7 @@ import yaml
 from bomb_pusht_cases import pusht_row
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
-from result_rows import read, values
+from result_rows import old_row, read, values
 from vla0_smol_cases import make_config
 
 from hub.server import LoopbackHub
@@ -169,6 +169,15 @@ def test_an_evaluation_is_repeated_on_the_tasks_that_it_was_of(asked: list[dict]
     records = [read(values(0, spec=each, image_size=64)) for each in asked]
     expected = ["--env.image_size=64", *([f"--env.{flag}"] if flag else [])]
     assert EpisodeResult.eval_flags(records)[5:] == expected
+
+
+def test_an_evaluation_is_repeated_with_its_own_settings() -> None:
+    spec = {"split": "heldout", "success_tolerance_mm": 20.0, "simulator": "sapien"}
+    changed = read(values(0, spec=spec, sapien_version="3.0.0", render_preset="shadows"))
+    flags = ["--env.split=heldout", "--env.success_tolerance_mm=20.0", "--env.simulator=sapien"]
+    assert EpisodeResult.eval_flags([changed])[6:] == [*flags, "--env.render_preset=shadows"]
+    unset = parse_record(old_row(0).encode())  # of a release that did not record the preset
+    assert unset.eval_flags([unset])[6:] == []
 
 
 def test_only_what_was_not_trained_is_said_to_be_a_start() -> None:

@@ -4,7 +4,7 @@ import shlex
 
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Section
-from lerobot_bomb.results.groups import Group, by_condition
+from lerobot_bomb.results.groups import Group, by_condition, by_task
 from lerobot_bomb.results.record import Record
 
 
@@ -18,9 +18,10 @@ def commands(group: Group) -> list[str]:
     """Describe the evaluations, and the flags that repeat them."""
     by, first = by_condition(group.records), group.records[0]
     seeds = {each.spec.seed for each in group.records}
+    most = max(len(episodes) for records in by.values() for episodes in by_task(records).values())
     flags = ["--policy.type=TYPE" if first.policy is None else first.policy.flag]
     flags += [*first.eval_flags(group.records), *first.condition_flags(by), *_as_evaluated(first)]
-    flags += [f"--seed={min(seeds)}", f"--eval.n_episodes={max(map(len, by.values()))}"]
+    flags += [f"--seed={min(seeds)}", f"--eval.n_episodes={most}"]
     return [*(f"  {line}" for line in group.lines()), f"  {shlex.join(['lerobot-eval', *flags])}"]
 
 
