@@ -240,10 +240,21 @@ def test_numbered_tasks_of_one_seed_are_clusters(path: Path, capsys: pytest.Capt
     assert expected in printed(path, "".join(one), capsys)
 
 
+CAMERA = {"perturbations": "camera:3"}
+
+
 def of_evaluation(seeds: range, num_episodes: int, seed: int = 0, **other: Any) -> str:
     """Write rows of these seeds, of an evaluation of so many episodes from `seed` on."""
     evaluation = {"num_episodes": num_episodes, "seed": seed}
     return "".join(row(each, evaluation=evaluation, **other) for each in seeds)
+
+
+def of_tasks(numbers: list[int], num_episodes: int, **spec: Any) -> str:
+    """Write rows of numbered tasks, so many of each, of one evaluation."""
+    return "".join(
+        of_evaluation(range(number), num_episodes, spec={"suite": "object", "task_id": task_id} | spec)
+        for task_id, number in enumerate(numbers)
+    )
 
 
 @pytest.mark.parametrize(
@@ -266,6 +277,24 @@ def of_evaluation(seeds: range, num_episodes: int, seed: int = 0, **other: Any) 
             "11 of 14",
         ),
         (of_evaluation(range(7), 14) + of_evaluation(range(4), 14, spec={"suite": "object"}), "11 of 14"),
+        # beside a whole one of another condition; of it, but for one task
+        (of_evaluation(range(20), 20) + of_evaluation(range(5), 20, spec=CAMERA), "5 of 20"),
+        (of_evaluation(range(20), 20) + of_evaluation(range(10), 20, spec=CAMERA), "10 of 20"),
+        (of_evaluation(range(15), 20) + of_evaluation(range(15), 20, spec=CAMERA), "15 of 20 and 15 of 20"),
+        (of_tasks([20, 20], 40) + of_tasks([20, 10], 40, **CAMERA), "30 of 40"),
+        # begun again after another condition; one condition alone with more episodes
+        (
+            of_evaluation(range(5), 20)
+            + of_evaluation(range(20), 20, spec=CAMERA)
+            + of_evaluation(range(20), 20),
+            "",
+        ),
+        (
+            of_evaluation(range(20), 40)
+            + of_evaluation(range(20), 40, spec=CAMERA)
+            + of_evaluation(range(40), 40),
+            "",
+        ),
     ],
 )
 def test_episodes_that_an_evaluation_lacks_are_told(

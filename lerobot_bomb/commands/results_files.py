@@ -1,13 +1,15 @@
 """Files of results that a command is given."""
 
 import sys
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lerobot_bomb.bomb.environment import numbered_task
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
-from lerobot_bomb.results.groups import PER_TASK, Group, groups_of, settings_of
+from lerobot_bomb.results.groups import PER_TASK, Group, groups_of, settings_of, suite_or_task
 from lerobot_bomb.results.names import policy_key, policy_names
 from lerobot_bomb.results.reading import check_any, read_records
 from lerobot_bomb.results.record import Record, Spec, describe_numbers
@@ -46,19 +48,50 @@ def missing_of_evaluations(path: Path, records: Sequence[Record]) -> str:
 
     An evaluation no longer counts once later ones have run each of its episodes again.
     """
-    kept = {_evaluation_of(each) for group in groups_of(records) for each in group.records}
-    specs: dict[Any, set[Spec]] = {}
+    kept = {id(each) for group in groups_of(records) for each in group.records}
+    current: set[tuple[Any, ...]] = set()  # parts with a record that later ones have not replaced
+    played: dict[Any, dict[Any, Counter[Spec]]] = {}  # {evaluation: {part: times that episodes were run}}
     for record in records:
-        if (key := _evaluation_of(record)) in kept:
-            specs.setdefault(key, set()).add(record.spec)
-    counts = [
-        f"{len(played)} of {evaluation.num_episodes}"
-        for (evaluation, *_), played in specs.items()
-        if evaluation is not None and len(played) < evaluation.num_episodes
-    ]
+        if record.evaluation is not None:
+            key, part = _evaluation_of(record), _part_of(record)
+            played.setdefault(key, {}).setdefault(part, Counter())[record.spec] += 1
+            if id(record) in kept:
+                current.add((key, part))
+    counts = []
+    for key, parts in played.items():
+        num_episodes = key[0].num_episodes
+        stopped = _stopped_parts(parts, num_episodes)
+        if any((key, part) in current for part in stopped):
+            numbers = [len(parts[part]) for part in stopped]
+            numbers = [sum(numbers)] if sum(numbers) < num_episodes else numbers
+            counts += [f"{number} of {num_episodes}" for number in numbers]
     if not counts:
         return ""
     return f"{path}: {' and '.join(counts)} episodes played; lerobot-eval was stopped, or still runs"
+
+
+def _stopped_parts(parts: Mapping[Any, Counter[Spec]], num_episodes: int) -> list[Any]:
+    """Return the parts that lack episodes, of evaluations with the same number of episodes and first seed.
+
+    All parts of an evaluation have equally many episodes: with n in each, it has num_episodes / n parts.
+    """
+    times_run = Counter(
+        sum(times >= repetition for times in part.values())
+        for part in parts.values()
+        for repetition in range(1, max(part.values()) + 1)
+    )
+    stopped = []
+    for number, times in times_run.items():
+        if number < num_episodes:
+            is_share = num_episodes % number == 0
+            num_whole = times - times % (num_episodes // number) if is_share else 0
+            stopped += [name for name, part in parts.items() if len(part) == number][num_whole:]
+    return stopped
+
+
+def _part_of(record: Record) -> tuple[Any, ...]:
+    """Return a key of a record's suite, condition and numbered task, which LeRobot evaluates one by one."""
+    return suite_or_task(record), record.spec.perturbations, numbered_task(vars(record.spec))
 
 
 def _evaluation_of(record: Record) -> tuple[Any, ...]:
