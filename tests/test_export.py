@@ -1,6 +1,7 @@
 """``lerobot-bomb export``: paper, model card and leaderboard say what the lines say."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,14 +9,14 @@ import pytest
 import yaml
 from huggingface_hub import DatasetCard, ModelCardData, parse_eval_result_entries
 from huggingface_hub.repocard_data import model_index_to_eval_results
-from result_rows import FDVLA, read, values
+from result_rows import FDVLA, old_row, read, row, values
 
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.hub.evaluations import model_index, model_index_yaml
 from lerobot_bomb.results.groups import groups_of
 from lerobot_bomb.results.origin import PolicyIdentity
-from lerobot_bomb.results.reading import read_records
+from lerobot_bomb.results.reading import parse_record, read_records
 
 SUCCESSES = {("act", "none"): 8, ("act", "all:1-5"): 3, ("fdvla", "none"): 9, ("fdvla", "all:1-5"): 0}
 N = 10
@@ -200,6 +201,17 @@ def test_the_benchmark_s_dataset_names_the_tasks_of_the_results(exported: Path) 
         (config["config_name"], files["split"])
     }
     assert read_records(folder / files["path"]) == read_records(exported.parent / "r.jsonl")
+
+
+@pytest.mark.parametrize("make", [row, old_row])
+def test_the_benchmark_s_records_read_back(make: Callable[..., str], tmp_path: Path) -> None:
+    lines = [make(seed, failure=failure).strip() for failure in ("dropped", None) for seed in range(4)]
+    path = tmp_path / "r.jsonl"
+    path.write_text("".join(f"{line}\n" for line in lines))
+    flags = [f"--output={tmp_path / 'out'}", "--benchmark_id=me/bomb"]
+    assert main(["export", str(path), str(path), *flags]) == 0
+    records, damages = read_records(tmp_path / "out" / "benchmark" / "records.jsonl")
+    assert (list(records.values()), damages) == ([parse_record(line.encode()) for line in lines[4:]], [])
 
 
 def test_tools_that_pair_by_seed_get_each_episode_and_what_it_is_of(

@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         model_index_yaml,
     )
 
-    records = [record for path in args.paths for record in read_undamaged(path).records]
+    records = [record for path in dict.fromkeys(args.paths) for record in read_undamaged(path).records]
     groups = groups_of(records, names_of(args.names, records))
     contents = {args.output / LATEX: latex_tables(groups)}
     policies = policies_of(groups)
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         if args.benchmark_id is not None:
             contents[args.output / name / EVAL_RESULTS] = eval_results_yaml(args.benchmark_id, policy.groups)
     if args.benchmark_id is not None:
-        files = benchmark_files(args.benchmark_id, groups, records)
+        files = benchmark_files(args.benchmark_id, groups)
         contents |= {args.output / BENCHMARK / name: content for name, content in files.items()}
     check_outputs(args.paths, contents)
     for path, content in contents.items():

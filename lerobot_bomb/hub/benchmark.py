@@ -9,7 +9,7 @@ from lerobot_bomb.hub.markdown import command, fenced, plain
 from lerobot_bomb.hub.push import CARD
 from lerobot_bomb.hub.rates import headline, results_table
 from lerobot_bomb.results.groups import Group
-from lerobot_bomb.results.record import Record
+from lerobot_bomb.results.reading import line_of
 
 EVAL = "eval.yaml"
 RECORDS = "records.jsonl"
@@ -21,17 +21,17 @@ ABOUT = {
 }
 
 
-def benchmark_files(benchmark_id: str, groups: Sequence[Group], records: Sequence[Record]) -> dict[str, str]:
+def benchmark_files(benchmark_id: str, groups: Sequence[Group]) -> dict[str, str]:
     """Return {name: content} of the files of a benchmark's repository.
 
     Args:
         benchmark_id: USER/NAME of the dataset.
-        groups: of the records; their suites and conditions are the tasks of the leaderboard.
-        records: of one env type.
+        groups: of one env type; their suites and conditions are the tasks of the leaderboard.
 
     Raises:
         ValueError: the records are of several env types.
     """
+    records = [record for group in groups for record in group.records]
     types = sorted({record.env_type for record in records})
     if len(types) > 1:
         raise ValueError(f"--benchmark_id={benchmark_id}: the records are of {' and '.join(types)}; give one")
@@ -42,7 +42,7 @@ def benchmark_files(benchmark_id: str, groups: Sequence[Group], records: Sequenc
     return {
         EVAL: as_yaml(evaluation),
         CARD: _card(benchmark_id, about, groups),
-        RECORDS: "".join(f"{record.to_json()}\n" for record in records),
+        RECORDS: "".join(f"{line_of(record)}\n" for record in records),
     }
 
 

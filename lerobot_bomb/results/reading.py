@@ -25,11 +25,29 @@ def record_type_of(version: str) -> type[Record] | None:
 
 @cache
 def _schema(record_type: type[Record], version: str) -> Schema[Record]:
-    """Return the schema of a protocol version; fields that only other versions lack are required."""
+    """Return the schema of a protocol version."""
+    return Schema(record_type, _may_lack(record_type, version), closed=("spec",))
+
+
+def _may_lack(record_type: type[Record], version: str) -> dict[str, Any]:
+    """Return {field that records of a protocol version may lack: its value then}."""
     of_others = {name for names in record_type.versions.values() for name in names}
     must_have = of_others - set(record_type.versions[version])
-    lacking = {name: value for name, value in record_type.earlier.items() if name not in must_have}
-    return Schema(record_type, lacking, closed=("spec",))
+    return {name: value for name, value in record_type.earlier.items() if name not in must_have}
+
+
+def line_of(record: Record) -> str:
+    """Return a line from which `parse_record` reads an equal record, of whichever release that was.
+
+    A value that stands for a missing field need not be possible, so it is left out.
+    """
+    values = record.as_json()
+    for name, value in _may_lack(type(record), record.protocol_version).items():
+        outer, _, inner = name.rpartition(".")
+        fields = values[outer] if outer else values
+        if fields is not None and fields[inner] == value:
+            del fields[inner]
+    return json.dumps(values, allow_nan=False)
 
 
 def read_records(path: Path) -> tuple[dict[int, Record], list[str]]:
