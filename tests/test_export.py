@@ -214,6 +214,15 @@ def test_the_benchmark_s_records_read_back(make: Callable[..., str], tmp_path: P
     assert (list(records.values()), damages) == ([parse_record(line.encode()) for line in lines[4:]], [])
 
 
+def test_the_benchmark_names_the_versions_of_its_suites(tmp_path: Path) -> None:
+    rows = [values(0), values(0, spec={"suite": "object"}, task_version="1.1", target=None)]
+    (tmp_path / "r.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    flags = [f"--output={tmp_path / 'out'}", "--benchmark_id=me/bomb"]
+    assert main(["export", str(tmp_path / "r.jsonl"), *flags]) == 0
+    about = yaml.safe_load((tmp_path / "out" / "benchmark" / "eval.yaml").read_text())["description"]
+    assert about.endswith("BOMB, task version 1.0; BOMB, task version 1.1.")
+
+
 def test_tools_that_pair_by_seed_get_each_episode_and_what_it_is_of(
     exported: Path, rows: list[dict[str, Any]]
 ) -> None:

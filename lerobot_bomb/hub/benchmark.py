@@ -38,7 +38,8 @@ def benchmark_files(benchmark_id: str, groups: Sequence[Group]) -> dict[str, str
     name = benchmark_id.partition("/")[2]
     about = ABOUT.get(types[0], f"LeRobot's {types[0]}.")
     tasks = [{"id": task_id, "config": CONFIG, "split": SPLIT} for task_id in task_ids_of(groups)]
-    evaluation = {"name": name, "description": f"{about} {records[0].benchmark()}.", "tasks": tasks}
+    versions = "; ".join(sorted({record.benchmark() for record in records}))
+    evaluation = {"name": name, "description": f"{about} {versions}.", "tasks": tasks}
     return {
         EVAL: as_yaml(evaluation),
         CARD: _card(benchmark_id, about, groups),
