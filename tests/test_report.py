@@ -197,11 +197,11 @@ def test_every_command_has_the_same_p_value_for_the_same_pairs(
     assert paths.splitlines() == [str(tmp_path / f"r.{suffix}") for suffix in ("html", "json", "csv")]
     assert main(["results", str(path), "--verbose"]) == 0
     said = capsys.readouterr().out
-    # 2 / 2^6 of one pair of conditions of two
-    assert said.count("camera:3: 6 pairs, 6 lost, 0 won, p = 0.062 (exact McNemar test, adjusted for 2") == 2
+    # 2 / 2^6 of one pair of conditions; a policy's conditions of both suites are one family
+    assert said.count("camera:3: 6 pairs, 6 lost, 0 won, p = 0.12 (exact McNemar test, adjusted for 4") == 2
     _, act, *_ = tables(tmp_path, "Success")
-    assert {row[0]: row[4] for row in act["rows"]} == {"none": "", "camera:3": 2 * 2 / 2**6, "light:3": 1.0}
-    assert "p: exact McNemar test, adjusted for 2 conditions (Holm)." in act["note"]
+    assert {row[0]: row[4] for row in act["rows"]} == {"none": "", "camera:3": 4 * 2 / 2**6, "light:3": 1.0}
+    assert "p: exact McNemar test, adjusted for 4 conditions (Holm)." in act["note"]
     # two policies: all six conditions of both suites are one family, in `compare` and on the page alike
     assert main(["compare", str(path)]) == 0
     said = capsys.readouterr().out

@@ -59,6 +59,23 @@ def test_all_policies_and_conditions_are_one_table(path: Path, capsys: Printed) 
     ]
 
 
+def test_p_values_are_adjusted_over_all_suites(path: Path, capsys: Printed, tmp_path: Path) -> None:
+    for suite in ("place", "object", "spatial"):
+        with path.open("a") as file:
+            for condition, failure in (("none", None), ("camera:3", "dropped")):
+                spec = {"perturbations": condition, "suite": suite}
+                file.write("".join(row(seed, failure, spec=spec, target=None) for seed in range(6)))
+    lines = said(capsys, path, "--verbose")
+    assert [line.split()[-2] for line in lines if " camera:3 " in line] == ["0.094"] * 3
+    assert (
+        sum("p = 0.094 (exact McNemar test, adjusted for 3 conditions (Holm))" in line for line in lines) == 3
+    )
+    assert main(["report", str(path), "--output=r.html"]) == 0
+    tables = json.loads(Path("r.json").read_text())[0]["charts"][0]["tables"]
+    p_values = [row[-1] for table in tables for row in table["rows"] if row[0] == "camera:3"]
+    assert p_values == [pytest.approx(3 * 2 / 2**6)] * 3
+
+
 def test_several_files_are_one_table_and_a_policy_has_one_name_in_it(path: Path, capsys: Printed) -> None:
     other = PolicyIdentity("act", "outputs/other", None, "e" * 64, "b" * 64)
     path.write_text(rows({"none": "++"}))

@@ -10,7 +10,7 @@ from lerobot_bomb.commands.next_steps import print_next
 from lerobot_bomb.commands.results_failures import print_failures
 from lerobot_bomb.commands.results_files import FileGroups, ResultsFile, read_undamaged
 from lerobot_bomb.commands.table import PROGRAM
-from lerobot_bomb.report.panels import Series
+from lerobot_bomb.report.panels import Series, series_of
 from lerobot_bomb.results.comparison import have_pairs
 from lerobot_bomb.results.groups import (
     POLICY,
@@ -56,13 +56,14 @@ def run(args: argparse.Namespace) -> int:
     if args.failures:
         print_failures(told)
         return 0
-    _print_rates(told)
+    series = _series_by_file(told)
+    _print_rates(told, series)
     print()
     print_lines(*LEGEND, *_notes(told))
     if args.verbose:
-        for each in told:
+        for each, of_file in zip(told, series, strict=True):
             print()
-            _print_details(each)
+            _print_details(each, of_file)
     print_next(_next_steps(told))
     return 0
 
@@ -73,19 +74,26 @@ def _policy_names(files: Iterable[ResultsFile]) -> dict[str, str]:
     return {group.settings[POLICY]: group.policy for group in groups_of(records)}
 
 
-def _print_rates(told: list[FileGroups]) -> None:
+def _series_by_file(told: list[FileGroups]) -> list[list[Series]]:
+    """Return the series of each file; the p-values of a policy are adjusted over all files."""
+    found = iter(series_of([group for each in told for group in each.groups]))
+    return [[next(found) for _ in each.groups] for each in told]
+
+
+def _print_rates(told: list[FileGroups], by_file: list[list[Series]]) -> None:
     """Print a line for each group and condition."""
     several = len(told) > 1
     apart = [*{name: None for each in told for name in differing_otherwise(each.groups)}]
     rows = [
         [
             *([str(each.file.path)] if several else []),
-            *(shorten(group.policy), suite_of(group), *(_setting(group, name) for name in apart)),
+            *(shorten(series.policy), suite_of(series.group)),
+            *(_setting(series.group, name) for name in apart),
             *cells,
         ]
-        for each in told
-        for group in each.groups
-        for cells in _cells(Series(0, group))
+        for each, of_file in zip(told, by_file, strict=True)
+        for series in of_file
+        for cells in _cells(series)
     ]
     header = [*(["file"] if several else []), "policy", "suite", *apart, "condition"]
     print_table([*header, "success", "change", "p (Holm)", "n"], rows, left=(*WORDS, *apart))
@@ -123,7 +131,7 @@ def _notes(told: list[FileGroups]) -> Iterator[str]:
                 yield f"{path}: {shorten(group.name)}: {unpaired}"
 
 
-def _print_details(told: FileGroups) -> None:
+def _print_details(told: FileGroups, series: list[Series]) -> None:
     """Print each group's heading, and the measures under each condition."""
     path = told.file.path
     if len(told.groups) > 1:
@@ -131,7 +139,7 @@ def _print_details(told: FileGroups) -> None:
             f"{path}: {len(told.groups)} groups of episodes, neither pooled nor paired with each other; they "
             f"differ in {', '.join(differing(told.groups))}"
         )
-    for group in told.groups:
+    for group, of_group in zip(told.groups, series, strict=True):
         print_lines(*(f"{path}: {line}" for line in group.lines()))
         if group.missing_fields:
             version = group.records[0].protocol_version
@@ -144,7 +152,7 @@ def _print_details(told: FileGroups) -> None:
             label = f" (perturbations={condition})" if len(conditions) > 1 else ""
             print(f"{path}{label}: {len(records)} episode{'s' * (len(records) != 1)}")
             print_lines(*(f"  {line}" for line in summarise(records).lines()))
-        if against := pair_lines(group):
+        if against := pair_lines([*of_group.costs.values()]):
             print(f"{path}: against the same episodes unperturbed", *against, sep="\n")
 
 

@@ -7,8 +7,9 @@ from functools import cached_property
 from lerobot_bomb.conditions import NONE, AxisCondition
 from lerobot_bomb.results.comparison import can_compare
 from lerobot_bomb.results.groups import PER_TASK, POLICY, Group, by_condition, differing, rate_of
-from lerobot_bomb.results.pairs import PairedComparison, compare_pairs, pair_with_nominal
+from lerobot_bomb.results.pairs import PairedComparison
 from lerobot_bomb.results.record import Record
+from lerobot_bomb.results.summary import changes_of
 from lerobot_bomb.stats import Rate
 
 MAX_CONDITIONS = 24  # that a chart can show below each other
@@ -21,6 +22,8 @@ class Series:
 
     place: int  # of the policy in the report, which has its colour
     group: Group
+    # changes by condition, against the same episodes unperturbed
+    costs: dict[str, PairedComparison]
 
     @property
     def policy(self) -> str:
@@ -35,11 +38,6 @@ class Series:
     def rates(self) -> dict[str, Rate]:
         """Rate of success by condition."""
         return {condition: rate_of(records) for condition, records in self.records.items()}
-
-    @cached_property
-    def costs(self) -> dict[str, PairedComparison]:
-        """Changes by condition, against the same episodes unperturbed."""
-        return {each.condition: each for each in compare_pairs(pair_with_nominal(self.group.records))}
 
     @cached_property
     def perturbed(self) -> Rate | None:
@@ -126,23 +124,28 @@ def _levels(condition: AxisCondition) -> int:
     return sum(high for _, _, high in condition.ranges)
 
 
+def series_of(groups: Sequence[Group]) -> list[Series]:
+    """Return the groups with the changes under each condition; p-values are adjusted for each policy."""
+    places = {name: place for place, name in enumerate(dict.fromkeys(each.policy for each in groups))}
+    return [
+        Series(places[group.policy], group, {each.condition: each for each in changes})
+        for group, changes in zip(groups, changes_of(groups), strict=True)
+    ]
+
+
 def panels_of(groups: Sequence[Group]) -> list[Panel]:
     """Put groups side by side that differ in nothing but their policies."""
-    places = {name: place for place, name in enumerate(dict.fromkeys(each.policy for each in groups))}
-    together: list[list[Group]] = []
-    for group in groups:
+    together: list[list[Series]] = []
+    for series in series_of(groups):
         for others in together:
-            is_new = all(group.policy != other.policy for other in others)
-            if is_new and all(can_compare(group, other) for other in others):
-                others.append(group)
+            is_new = all(series.policy != other.policy for other in others)
+            if is_new and all(can_compare(series.group, other.group) for other in others):
+                others.append(series)
                 break
         else:
-            together.append([group])
-    names = _panel_names([each[0] for each in together])
-    return [
-        Panel(name, [Series(places[each.policy], each) for each in panel_groups])
-        for name, panel_groups in zip(names, together, strict=True)
-    ]
+            together.append([series])
+    names = _panel_names([each[0].group for each in together])
+    return [Panel(name, panel_series) for name, panel_series in zip(names, together, strict=True)]
 
 
 def _panel_names(groups: list[Group]) -> list[str]:

@@ -90,11 +90,21 @@ def count_pairs(pairs: Sequence[Pair]) -> PairedCounts:
 
 def compare_pairs(pairs: Mapping[str, list[Pair]]) -> list[PairedComparison]:
     """Compare the pairs of each condition; the p-values are adjusted as one family (Holm)."""
-    counts = {condition: count_pairs(condition_pairs) for condition, condition_pairs in pairs.items()}
-    adjusted = holm([each.p_value for each in counts.values()])
+    (compared,) = compare_family([pairs])
+    return compared
+
+
+def compare_family(suites: Sequence[Mapping[str, list[Pair]]]) -> list[list[PairedComparison]]:
+    """Compare the pairs of each condition of several suites; all their p-values are one family (Holm)."""
+    counts = [[*map(count_pairs, pairs.values())] for pairs in suites]
+    adjusted = holm([each.p_value for of_suite in counts for each in of_suite])
+    p_values = iter(adjusted)
     return [
-        PairedComparison(condition, condition_pairs, counts[condition], p_value, len(pairs))
-        for (condition, condition_pairs), p_value in zip(pairs.items(), adjusted, strict=True)
+        [
+            PairedComparison(condition, condition_pairs, count, next(p_values), len(adjusted))
+            for (condition, condition_pairs), count in zip(pairs.items(), of_suite, strict=True)
+        ]
+        for pairs, of_suite in zip(suites, counts, strict=True)
     ]
 
 

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from lerobot_bomb.results import efficiency
-from lerobot_bomb.results.groups import Group, differing, rate_of
+from lerobot_bomb.results.groups import POLICY, Group, differing, rate_of
 from lerobot_bomb.results.measures import Measure
-from lerobot_bomb.results.pairs import PairedComparison, compare_pairs, describe_test, pair_with_nominal
+from lerobot_bomb.results.pairs import PairedComparison, compare_family, describe_test, pair_with_nominal
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.stats import Rate, format_p
 
@@ -59,9 +59,24 @@ def _pair_line(compared: PairedComparison) -> str:
     )
 
 
-def pair_lines(group: Group) -> list[str]:
+def changes_of(groups: Sequence[Group]) -> list[list[PairedComparison]]:
+    """Compare each group's conditions with its unperturbed episodes.
+
+    The p-values of a policy are adjusted as one family, whatever its groups.
+    """
+    places: dict[str, list[int]] = {}
+    for place, group in enumerate(groups):
+        places.setdefault(group.settings[POLICY], []).append(place)
+    changes: dict[int, list[PairedComparison]] = {}
+    for of_policy in places.values():
+        pairs = [pair_with_nominal(groups[place].records) for place in of_policy]
+        changes |= zip(of_policy, compare_family(pairs), strict=True)
+    return [changes[place] for place in range(len(groups))]
+
+
+def pair_lines(changes: Sequence[PairedComparison]) -> list[str]:
     """Describe how perturbations changed a group's successes."""
-    return list(map(_pair_line, compare_pairs(pair_with_nominal(group.records))))
+    return list(map(_pair_line, changes))
 
 
 def describe_unpaired(group: Group, groups: Sequence[Group]) -> str:

@@ -164,7 +164,7 @@ def conditions(series: Series) -> Table:
     if costs:
         note += (
             " Points: difference in percentage points from the same episodes unperturbed, with Newcombe's "
-            f"95 % interval for pairs; p: {describe_test(len(costs))}."
+            f"95 % interval for pairs; p: {describe_test(next(iter(costs.values())).num_conditions)}."
         )
     header = ["condition", "success", "episodes", *(["points", "p"] if costs else [])]
     return Table(series.group.name, header, [row(condition) for condition in series.records], note)
