@@ -108,6 +108,18 @@ def test_other_settings_are_panels_of_their_own(report: Callable[..., dict[str, 
     assert section["lines"] == [] and "image_size 64" in section["statements"][1]
 
 
+def test_long_settings_tell_panels_apart(report: Callable[..., dict[str, Any]]) -> None:
+    renderers = (
+        "llvmpipe (LLVM 15.0.7, 256 bits)",
+        "NVIDIA H200/PCIe/SSE2",
+        "llvmpipe (LLVM 16.0.7, 256 bits)",
+    )
+    rows = [values(0) | {"opengl_renderer": each} for each in renderers]
+    said = [text.split(" unperturbed")[-1] for text in report(rows)["Success"]["statements"]]
+    names = ["Mesa, llvmpi…, 256 bits) (1)", "Mesa, NVIDIA…0/PCIe/SSE2", "Mesa, llvmpi…, 256 bits) (2)"]
+    assert [text.partition(" OpenGL ")[2].rstrip(".") for text in said] == names
+
+
 @pytest.mark.parametrize("version", ["1.0", "1.1"])
 def test_the_version_of_a_task_is_said_where_the_suite_has_several(
     version: str, report: Callable[..., dict[str, Any]]

@@ -7,10 +7,12 @@ from functools import cached_property
 from lerobot_bomb.conditions import NONE, AxisCondition
 from lerobot_bomb.results.comparison import can_compare
 from lerobot_bomb.results.groups import PER_TASK, POLICY, Group, by_condition, differing, rate_of
+from lerobot_bomb.results.names import numbered
 from lerobot_bomb.results.pairs import PairedComparison
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.results.summary import changes_of
 from lerobot_bomb.stats import Rate
+from lerobot_bomb.tables import shorten
 
 MAX_CONDITIONS = 24  # that a chart can show below each other
 MAX_SETTING = 24  # characters of a setting in the name of a panel
@@ -149,7 +151,7 @@ def panels_of(groups: Sequence[Group]) -> list[Panel]:
 
 
 def _panel_names(groups: list[Group]) -> list[str]:
-    """Name panels by their suites, and by short settings that differ between them."""
+    """Name panels by their suites, and by the settings that differ between them."""
     tasks = {tuple(map(each.settings.get, PER_TASK)) for each in groups}
     is_told = len(tasks) == len({suite for suite, _ in tasks})  # a suite of one version: its name says it
     told = (POLICY, *(PER_TASK if is_told else PER_TASK[:1]))
@@ -160,6 +162,6 @@ def _panel_names(groups: list[Group]) -> list[str]:
         parts = [group.record_type.env_type] if len(types) > 1 else []
         parts += [group.settings["suite"]] if "suite" in group.settings else []
         shown = ((name, group.settings.get(name, "")) for name in several)
-        parts += [f"{name} {value}" for name, value in shown if 0 < len(value) <= MAX_SETTING]
+        parts += [f"{name} {shorten(value, MAX_SETTING)}" for name, value in shown if value]
         names.append(", ".join(parts))
-    return names
+    return numbered(names)
