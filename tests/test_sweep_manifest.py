@@ -13,7 +13,7 @@ from lerobot_bomb.commands.main import EVAL_FLAGS
 from lerobot_bomb.commands.results_files import missing_of_sweep
 from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.manifest import Job, Manifest, plan, policy_flag
-from lerobot_bomb.sweep.store import Store
+from lerobot_bomb.sweep.store import EpisodeError, Store
 
 
 def test_a_plan_is_every_policy_on_every_task_under_every_condition() -> None:
@@ -262,9 +262,28 @@ def test_readers_say_what_a_sweep_that_was_stopped_lacks(tmp_path: Path) -> None
     assert missing_of_sweep(results, 2) == (
         f"{results}: 4 of 6 episodes are missing; `lerobot-bomb sweep {tmp_path}` resumes"
     )
-    (tmp_path / "errors.jsonl").write_text("{}\n{}\n")
-    errors = f"an error ended 2: {tmp_path / 'errors.jsonl'}"
+    error = EpisodeError(manifest.jobs[0].key, 7, "ValueError", "lerobot-eval").to_json()
+    (tmp_path / "errors.jsonl").write_text(f"{error}\n{error}\n")
+    again = f"`lerobot-bomb sweep {tmp_path} --retry` runs them again"
+    errors = f"an error ended 2: {tmp_path / 'errors.jsonl'}, {again}"
     assert missing_of_sweep(results, 4) == f"{results}: 2 of 6 episodes are missing; {errors}"
     assert missing_of_sweep(tmp_path / "other.jsonl", 2) == ""
+    (tmp_path / "errors.jsonl").write_text("{}\n")
+    assert "whether episodes are missing cannot be said: " in missing_of_sweep(results, 2)
+    (tmp_path / "errors.jsonl").unlink()
     (tmp_path / "manifest.json").write_text('{"version"')
     assert "whether episodes are missing cannot be said: " in missing_of_sweep(results, 2)
+
+
+def test_an_error_ends_an_episode_of_every_task(tmp_path: Path) -> None:
+    flags = (*FLAGS, "--env.task_ids=[0,3]")
+    manifest = plan(
+        ("bomb_expert",), ("place",), ("none",), seed=7, num_episodes=3, batch_size=1, flags=flags
+    )
+    manifest.write(tmp_path)
+    store, (job,) = Store(tmp_path, manifest), manifest.jobs
+    store.finish(job, 2 * lines_of(job)[:2], [EpisodeError(job.key, 9, "ValueError", "lerobot-eval")])
+    store.merge()
+    assert "2 episodes have no result" in "\n".join(store.lines())
+    missing = missing_of_sweep(tmp_path / "results.jsonl", 4)
+    assert "2 of 6 episodes are missing; an error ended 2: " in missing and "resumes" not in missing

@@ -14,7 +14,7 @@ from lerobot_bomb.results.names import policy_key, policy_names
 from lerobot_bomb.results.reading import check_any, read_records
 from lerobot_bomb.results.record import Record, Spec, describe_numbers
 from lerobot_bomb.sweep.manifest import NAME, Manifest
-from lerobot_bomb.sweep.store import ERRORS, RESULTS
+from lerobot_bomb.sweep.store import ERRORS, RESULTS, num_lost, read_errors
 
 MAX_SHOWN_DAMAGES = 10
 
@@ -31,15 +31,16 @@ def missing_of_sweep(path: Path, num_records: int) -> str:
     """Say how many episodes a sweep's file lacks, and why; "" if none, or if it is another file."""
     if path.name != RESULTS or not path.with_name(NAME).is_file():
         return ""
-    try:
-        number = Manifest.read(path.parent).num_records
-    except ValueError as error:  # the episodes can be read all the same
-        return f"{path}: whether episodes are missing cannot be said: {error}"
     errors = path.with_name(ERRORS)
+    try:
+        manifest = Manifest.read(path.parent)
+        ended = num_lost(manifest, read_errors(errors))
+    except (ValueError, TypeError) as error:  # the episodes can be read all the same
+        return f"{path}: whether episodes are missing cannot be said: {error}"
+    number, sweep = manifest.num_records, f"lerobot-bomb sweep {path.parent}"
     missing = number - num_records
-    num_errors = errors.read_bytes().count(b"\n") if errors.is_file() else 0
-    reasons = [f"an error ended {num_errors}: {errors}"] if num_errors else []
-    reasons += [f"`lerobot-bomb sweep {path.parent}` resumes"] if missing > num_errors else []
+    reasons = [f"an error ended {ended}: {errors}, `{sweep} --retry` runs them again"] if ended else []
+    reasons += [f"`{sweep}` resumes"] if missing > ended else []
     return f"{path}: {missing} of {number} episodes are missing; {'; '.join(reasons)}" if missing > 0 else ""
 
 

@@ -63,9 +63,14 @@ class Job:
         return flag_value(self.env, "--env.type") or ""
 
     @property
+    def num_tasks(self) -> int:
+        """Tasks, each with an episode of every seed, as far as the flags tell how many there are."""
+        return env_type(self.env_type).record.num_tasks(self.env)
+
+    @property
     def num_records(self) -> int:
-        """Episodes of all its tasks together, as far as the flags tell how many tasks there are."""
-        return self.num_episodes * env_type(self.env_type).record.num_tasks(self.env)
+        """Episodes of all its tasks together."""
+        return self.num_episodes * self.num_tasks
 
     def episode(self, number: int) -> "Job":
         """Return the job of one of its episodes."""

@@ -7,7 +7,7 @@ attempts at most in one run. Stopping a sweep, whose workers may outlive it by m
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from fcntl import LOCK_EX, LOCK_NB, flock
@@ -27,7 +27,7 @@ JOBS, RESULTS, ERRORS = "cells", "results.jsonl", "errors.jsonl"
 
 @dataclass(frozen=True)
 class EpisodeError:
-    """An episode without a result, which does not count as a failure."""
+    """A seed whose episodes, one of each task, have no result, which does not count as a failure."""
 
     job: str  # its key
     seed: int
@@ -49,6 +49,12 @@ class EpisodeError:
         return cls(
             **{"job" if name == "cell" else name: value for name, value in dict(json.loads(line)).items()}
         )
+
+
+def num_lost(manifest: Manifest, errors: Iterable[EpisodeError]) -> int:
+    """Count the episodes that have no result because of these errors: those of all tasks of their seeds."""
+    num_tasks = {job.key: job.num_tasks for job in manifest.jobs}
+    return sum(num_tasks.get(error.job, 0) for error in errors)
 
 
 def missing_seeds(job: Job, lines: Sequence[str | bytes], errors: Sequence[EpisodeError]) -> list[int]:
@@ -214,9 +220,8 @@ class Store:
             f"{len(finished)} of {len(jobs)} jobs"
         ]
         if errors:
-            text.append(
-                f"{self.folder / ERRORS}: {len(errors)} episodes have no result, an error ended them:"
-            )
+            number = num_lost(self.manifest, errors)
+            text.append(f"{self.folder / ERRORS}: {number} episodes have no result, an error ended them:")
             causes = Counter(error.error for error in errors)
             text += [f"  {number} x {cause}" for cause, number in causes.most_common()]
         given_up = [job for job in jobs if not self.is_finished(job) and self.is_over(job)]
@@ -234,11 +239,20 @@ class Store:
 
     def errors(self, job: Job) -> list[EpisodeError]:
         """Return the errors of a finished job."""
-        return [EpisodeError.from_json(line) for line in _read(self.file(job, "errors")).splitlines()]
+        return read_errors(self.file(job, "errors"))
 
     def _of_other_manifests(self) -> list[Path]:
         known = {job.key for job in self.manifest.jobs}
         return [path for path in sorted((self.folder / JOBS).glob("*.jsonl")) if path.stem not in known]
+
+
+def read_errors(path: Path) -> list[EpisodeError]:
+    """Read a file of errors; none where there is no file.
+
+    Raises:
+        ValueError, TypeError: a line is no error of an episode.
+    """
+    return [EpisodeError.from_json(line) for line in _read(path).splitlines()]
 
 
 def _read(path: Path) -> bytes:
