@@ -88,6 +88,11 @@ def test_what_these_episodes_do_not_show_is_left_open(arms: dict[str, Records]) 
     ]  # fmt: skip
 
 
+def test_a_batch_of_one_is_not_asked_about(arms: dict[str, Records]) -> None:
+    del arms[ALONE]
+    assert "the batch size does not change the success rate" not in answers(arms)
+
+
 def test_tasks_that_share_seeds_are_paired_task_by_task() -> None:
     def tasks(shift: float) -> Records:
         spec = {"color": "black"}

@@ -48,7 +48,9 @@ def verdict_tables(groups: Mapping[str, list[Record]], verdicts: list[Verdict]) 
 def judge(groups: Mapping[str, list[Record]], trained_seeds: Sequence[int] | None) -> list[Verdict]:
     """Judge every question that the groups can answer."""
     policy = groups[POLICY]
-    found = [_same_again(pairs_of(policy, groups[AGAIN])), _same_alone(pairs_of(policy, groups[ALONE]))]
+    found = [_same_again(pairs_of(policy, groups[AGAIN]))]
+    if groups.get(ALONE):
+        found.append(_same_alone(pairs_of(policy, groups[ALONE])))
     for name, question in ((BLANK, "looks at the images"), (OTHER_INSTRUCTION, "reads the instruction")):
         if groups.get(name):
             found.append(_depends(question, name, pairs_of(policy, groups[name])))
