@@ -100,6 +100,8 @@ def test_flags_and_processors_are_part_of_who_acts_and_a_place_is_not(checkpoint
     assert first == again == other_place
     assert len({first, other_flag, other_processor}) == 3
     assert len({who.weights_sha256 for who in seen}) == 1
+    first, again, other_flag, other_place, other_processor = (who.config_sha256 for who in seen)
+    assert first == again == other_place == other_processor != other_flag
 
 
 def test_a_flag_that_a_release_added_leaves_who_acts_as_it_was() -> None:

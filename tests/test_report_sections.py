@@ -129,12 +129,15 @@ def test_language_use_equals_a_recount(num_deaf: int, report: Callable[..., dict
     assert not any(line.startswith("Language use") for line in sections["Not in these files"]["lines"])
 
 
-@pytest.mark.parametrize("planted", [{"weights_sha256": "f" * 64}, {"interventions": []}])
+@pytest.mark.parametrize(
+    "planted", [{"weights_sha256": "f" * 64}, {"interventions": []}, {"config_sha256": "f" * 64}]
+)
 def test_other_weights_or_no_intervention_say_nothing_of_language(
     planted: dict[str, Any], report: Callable[..., dict[str, Any]]
 ) -> None:
     rows = told_otherwise(0)
     for row in rows:
+        row["policy"] |= {"config_sha256": "0" * 64}
         if row["policy"]["interventions"]:
             row["policy"] |= planted
     sections = report(rows)

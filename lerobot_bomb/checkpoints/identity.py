@@ -73,14 +73,16 @@ def _of_checkpoint(config: PreTrainedConfig) -> PolicyIdentity:
     path, revision = str(config.pretrained_path), config.pretrained_revision
     weights = weights_file(path, revision, config.use_peft)
     is_folder = Path(path).is_dir()
+    of_config, of_settings = (None, None) if weights is None else _settings_sha256(config, weights.parent)
     return PolicyIdentity(
         type=config.type,
         path=path,
         revision=revision if is_folder or weights is None else weights.parent.name,
         weights_sha256=None if weights is None else sha256_of(weights),
-        settings_sha256=None if weights is None else _settings_sha256(config, weights.parent),
+        settings_sha256=of_settings,
         base=_base(path, revision) if config.use_peft else None,
         interventions=() if weights is None else _interventions(weights.parent),
+        config_sha256=of_config,
     )
 
 
@@ -91,8 +93,11 @@ def _interventions(folder: Path) -> tuple[str, ...]:
     return tuple(name for name in names if name in (BLANK_IMAGES, REPLACE_TASKS))
 
 
-def _settings_sha256(config: PreTrainedConfig, folder: Path) -> str:
-    """Return the SHA-256 of all that changes what weights do: flags of this evaluation, and processors."""
+def _settings_sha256(config: PreTrainedConfig, folder: Path) -> tuple[str, str]:
+    """Return the SHA-256 of the config with this evaluation's flags, and of it with the processors.
+
+    The second is of all that changes what weights do.
+    """
     settings: Any = draccus.encode(config)
     settings = {name: value for name, value in settings.items() if name not in NOT_ITS_SETTINGS}
     for name, as_before in getattr(config, "LATER_FIELDS", {}).items():
@@ -100,10 +105,11 @@ def _settings_sha256(config: PreTrainedConfig, folder: Path) -> str:
             if name in values and values[name] == as_before:
                 del values[name]
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
+    of_config = digest.hexdigest()
     found = (path for pattern in PROCESSOR_PATTERNS for path in folder.glob(pattern))
     for path in sorted(path for path in found if path.is_file()):
         digest.update(f"{path.name} {sha256_of(path)}".encode())
-    return digest.hexdigest()
+    return of_config, digest.hexdigest()
 
 
 def _base(path: str, revision: str | None) -> str | None:

@@ -77,6 +77,8 @@ class PolicyIdentity:
     batch_size: Count | None = None
     batch_row: Natural | None = None  # row of this episode in the batch
     interventions: tuple[str, ...] = ()  # names of the preprocessor's steps that change the input on purpose
+    # SHA-256 of the config with this evaluation's flags, without the processors
+    config_sha256: Sha256 | None = None
 
     def describe(self) -> str:
         """Describe the policy: 'act', or 'act outputs/act (weights 0123456789ab, settings 0123456789ab)'."""

@@ -73,6 +73,7 @@ class Record(ABC):
         "policy.batch_size": None,
         "policy.batch_row": None,
         "policy.interventions": (),
+        "policy.config_sha256": None,
     }
     # fields of a spec that may differ between pooled episodes, beside seed and perturbations
     drawn: ClassVar[tuple[str, ...]] = ()

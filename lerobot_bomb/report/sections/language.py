@@ -28,7 +28,7 @@ def section(report: Report) -> Section:
         for own in policies
         if not _interventions(own)
         for other in policies
-        if _interventions(other) == [REPLACE_TASKS] and _weights(own) == _weights(other) != ""
+        if _interventions(other) == [REPLACE_TASKS] and _differ_in_processors(own, other)
         for table in _tables(own, other)
     ]
     return Section(TITLE, tables)
@@ -61,6 +61,12 @@ def _interventions(reported: Policy) -> list[str]:
     return [] if policy is None else list(policy.interventions)
 
 
-def _weights(reported: Policy) -> str:
-    policy = reported.records[0].policy
-    return (policy and policy.weights_sha256) or ""
+def _differ_in_processors(reported: Policy, reported_too: Policy) -> bool:
+    """Return True for the same weights with the same config, which earlier releases did not record."""
+    policy, other = (each.records[0].policy for each in (reported, reported_too))
+    if policy is None or other is None or policy.weights_sha256 is None:
+        return False
+    is_recorded = None not in (policy.config_sha256, other.config_sha256)
+    return policy.weights_sha256 == other.weights_sha256 and (
+        not is_recorded or policy.config_sha256 == other.config_sha256
+    )
