@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from result_rows import FDVLA, old_row, read, row, values
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.hub.evaluations import model_index, model_index_yaml
+from lerobot_bomb.report.eval_info import eval_info_files
 from lerobot_bomb.results.groups import groups_of
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_bomb.results.reading import parse_record, read_records
@@ -235,6 +237,16 @@ def test_tools_that_pair_by_seed_get_each_episode_and_what_it_is_of(
             (seed, seed < successes) for seed in range(N)
         ]
         assert (meta["task"], meta["environment"], meta["policy_family"]) == (run.name, "bomb", policy)
+
+
+def test_other_settings_are_another_checkpoint_id(tmp_path: Path) -> None:
+    policies = [FDVLA, replace(FDVLA, settings_sha256="e" * 64), replace(FDVLA, path="elsewhere")]
+    ids = [
+        json.loads(eval_info_files(groups_of([read(values(0, policy=policy))]))["place.none/run_meta.json"])
+        for policy in policies
+    ]
+    first, other, moved = (each["checkpoint_id"] for each in ids)
+    assert first == moved != other
 
 
 def test_numbered_tasks_are_exported_apart(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def _run_meta(task: str, record: Record) -> dict[str, Any]:
         "environment_version": record.benchmark(),
         "embodiment": getattr(record.spec, "robot", None),
         "policy_family": policy and policy.type,
-        "checkpoint_id": policy and (policy.weights_sha256 or policy.path),
+        "checkpoint_id": policy and policy.key,
         "run_kind": "simulation",
     }
 
