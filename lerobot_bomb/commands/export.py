@@ -45,8 +45,8 @@ def run(args: argparse.Namespace) -> int:
     # huggingface_hub takes a second
     from lerobot_bomb.hub.benchmark import benchmark_files
     from lerobot_bomb.hub.evaluations import (
-        check_comparable,
         check_one_rate_each,
+        check_policies_compare,
         eval_results_yaml,
         model_index_yaml,
     )
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     for policy in policies:
         check_one_rate_each(policy.groups)
     if args.eval_info or args.benchmark_id is not None:
-        check_comparable(groups)
+        check_policies_compare(groups)
     for name, policy in zip(names, policies, strict=True):
         contents[args.output / name / MODEL_INDEX] = model_index_yaml(name, policy.groups)
         if args.eval_info:

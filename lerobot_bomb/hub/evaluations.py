@@ -81,7 +81,7 @@ def check_one_rate_each(groups: list[Group]) -> None:
             )
 
 
-def check_comparable(groups: Iterable[Group]) -> None:
+def check_policies_compare(groups: Iterable[Group]) -> None:
     """Raise a ValueError if policies have rates of one name, of episodes that must not be compared."""
     earlier: dict[str, list[Group]] = {}
     for group, condition, records in _conditions(groups):
