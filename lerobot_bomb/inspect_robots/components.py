@@ -1,4 +1,4 @@
-"""What `pyproject.toml` registers beside the tasks; made here so that a list of them loads no model."""
+"""Components that `pyproject.toml` registers beside the tasks, made here: a list of them loads no model."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -21,7 +21,7 @@ from lerobot_bomb.checkpoints.environment import check_acting_policy
 from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.envs.rollout import ENV_ID
 from lerobot_bomb.inspect_robots import config_errors
-from lerobot_bomb.inspect_robots.spaces import action_space, notes, observation_space
+from lerobot_bomb.inspect_robots.spaces import action_box, notes, observed_space
 from lerobot_bomb.inspect_robots.tasks import EPISODE
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_bomb.results.writing import check_results_path
@@ -46,8 +46,8 @@ class BombEmbodiment(EmbodimentBase):
         config = self._config
         self.info = EmbodimentInfo(
             name="bomb",
-            action_space=action_space(config.control_mode),
-            observation_space=observation_space(config.render_options.image_size),
+            action_space=action_box(config.control_mode),
+            observation_space=observed_space(config.render_options.image_size),
             control_hz=config.fps,
             is_simulated=True,
             capabilities=frozenset({PRIVILEGED_SUCCESS}),

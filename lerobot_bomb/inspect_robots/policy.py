@@ -16,7 +16,7 @@ from lerobot_bomb.checkpoints.environment import trained_environment
 from lerobot_bomb.checkpoints.identity import identity_of_config
 from lerobot_bomb.checkpoints.standalone import StandalonePolicy
 from lerobot_bomb.inspect_robots import config_errors
-from lerobot_bomb.inspect_robots.spaces import action_space
+from lerobot_bomb.inspect_robots.spaces import action_box
 
 
 class CheckpointPolicy(PolicyBase):
@@ -60,7 +60,7 @@ class CheckpointPolicy(PolicyBase):
         shape = tuple(config.output_features[ACTION].shape)
         self.info = PolicyInfo(
             name=f"{config.type} of {checkpoint}",
-            action_space=Box(shape) if environment is None else action_space(environment.control_mode),
+            action_space=Box(shape) if environment is None else action_box(environment.control_mode),
             observation_space=ObservationSpace(specs, frozenset(self._state)),
             control_hz=None if environment is None else environment.fps,
             checkpoint=identity_of_config(config).weights_sha256,

@@ -27,7 +27,7 @@ State: eef_pos is the point between the fingers' lower ends, gripper_width the d
 The gripper's point stays within x {x}, y {y}, z {z} m."""
 
 
-def action_space(control_mode: str) -> Box:
+def action_box(control_mode: str) -> Box:
     """Return the box of actions (4,) of a value of --env.control_mode."""
     low, high = action_bounds(control_mode)
     semantics = ActionSemantics(
@@ -39,7 +39,7 @@ def action_space(control_mode: str) -> Box:
     return Box((ACTION_DIM,), low, high, semantics)
 
 
-def observation_space(image_size: int) -> ObservationSpace:
+def observed_space(image_size: int) -> ObservationSpace:
     """Return both cameras, and the state twice: in one array, as policies read it, and by its parts."""
     cameras = tuple(CameraSpec(name, image_size, image_size) for name in CAMERAS)
     fields = (
