@@ -85,6 +85,18 @@ def test_what_must_not_be_pooled_is_compared_apart(a: Path, b: Path, capsys: Pri
     assert "image_size 256, none: 3 pairs" in out and "image_size 64, none: 3 pairs" in out
 
 
+def test_renderers_of_either_side_are_compared_apart(a: Path, b: Path, capsys: Printed) -> None:
+    for seed, renderer, failure in ((0, "llvmpipe", None), (1, "H200", "dropped")):
+        for path, policy, drawn in ((a, ACT, None), (b, FDVLA, renderer)):
+            line = values(seed, failure, policy=policy, opengl_vendor=drawn, opengl_renderer=drawn)
+            with path.open("a") as file:
+                file.write(json.dumps(line) + "\n")
+    for files in ((a, b), (b, a)):
+        assert compare(*files) == 0
+        out = capsys.readouterr().out
+        assert "OpenGL llvmpipe, llvmpipe, none: 1 pairs" in out and "OpenGL H200, H200, none: 1 pairs" in out
+
+
 def test_pairs_that_share_seeds_are_said_to(a: Path, b: Path, capsys: Printed) -> None:
     for target in ((0, 0), (1, 1)):
         for path, policy in ((a, ACT), (b, FDVLA)):

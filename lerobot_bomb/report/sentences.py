@@ -172,7 +172,8 @@ def _why_not_ranked(panel: Panel) -> str:
 
 def describe_comparison(first: Series, second: Series, compared: Comparisons) -> Statement:
     """Say which of two policies of a panel is better, and under which conditions."""
-    found = [each for each in compared.conditions if _is_of(each, first)]
+    settings = first.group.settings, second.group.settings
+    found = [each for each in compared.conditions if tuple(map(settings_of, each.pairs[0])) == settings]
     nominal = [each for each in found if each.pairs[0][0].spec.perturbations == NONE]
     others = [each for each in found if each.pairs[0][0].spec.perturbations != NONE]
     names = shorten(first.policy), shorten(second.policy)
@@ -183,10 +184,6 @@ def describe_comparison(first: Series, second: Series, compared: Comparisons) ->
     elif others:
         parts.append(_perturbed_verdict(others, *names))
     return Statement(f"{names[0]} against {names[1]}:", " ".join(parts) or "no episode of both.")
-
-
-def _is_of(compared: PairedComparison, series: Series) -> bool:
-    return settings_of(compared.pairs[0][0]) == series.group.settings
 
 
 def _perturbed_verdict(found: Sequence[PairedComparison], first: str, second: str) -> str:

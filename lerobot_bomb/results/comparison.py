@@ -1,6 +1,6 @@
 """Comparison of two policies on the same episodes: which is better, by how much, and is it certain?"""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,10 @@ from lerobot_bomb.results.pairs import Pair, PairedComparison, compare_pairs, de
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.stats import format_p
 
+ABSENT = "none"  # value of a setting that a record lacks, as the version of SAPIEN
+
 type Values = dict[str, set[str]]  # of settings
+type Settings = dict[str, str]  # {name: the value in a pair, or both values}
 
 
 @dataclass(frozen=True)
@@ -151,21 +154,24 @@ def _names(
     return f"{name}, {across} {first.settings[across]}", f"{name}, {across} {second.settings[across]}"
 
 
-def _by_condition(pairs: list[tuple[Group, Pair]]) -> dict[str, list[Pair]]:
+def _by_condition(pairs: list[tuple[Settings, Pair]]) -> dict[str, list[Pair]]:
     """Split pairs by condition, and by every setting with several values, such as the suite."""
-    settings = [dict(items) for items in dict.fromkeys(tuple(group.settings.items()) for group, _ in pairs)]
+    settings = [dict(items) for items in dict.fromkeys(tuple(each.items()) for each, _ in pairs)]
     names = dict.fromkeys(name for values in settings for name in values if name != POLICY)
     several = [name for name in names if len({values.get(name) for values in settings}) > 1]
     labelled: dict[str, list[Pair]] = {}
-    for group, pair in pairs:
-        shown = (_shown(name, group.settings.get(name)) for name in several)
-        labelled.setdefault(", ".join([*shown, pair[0].spec.perturbations]), []).append(pair)
+    for values, pair in pairs:
+        label = _condition_label(several, values, pair[0].spec.perturbations)
+        labelled.setdefault(label, []).append(pair)
     return labelled
 
 
-def _shown(name: str, value: str | None) -> str:
-    """Return 'place' for a suite, 'fps 20' for another setting."""
-    return f"{value}" if name == "suite" else f"{name} {value}"
+def _condition_label(names: Iterable[str], values: Settings, perturbations: str) -> str:
+    """Return 'place, fps 20, camera:3': these settings and the perturbations."""
+    shown = ((name, values.get(name, ABSENT)) for name in names)
+    return ", ".join(
+        [*(value if name == "suite" else f"{name} {value}" for name, value in shown), perturbations]
+    )
 
 
 def _only_policy(name: str, groups: list[Group]) -> str:
@@ -179,20 +185,34 @@ def _only_policy(name: str, groups: list[Group]) -> str:
     return groups[0].records[0].describe_policy()
 
 
-def _pairs(first: list[Group], second: list[Group], across: str | None) -> Iterator[tuple[Group, Pair]]:
-    """Yield each pair with the group of its first record."""
+def _pairs(first: list[Group], second: list[Group], across: str | None) -> Iterator[tuple[Settings, Pair]]:
+    """Yield each pair with the settings of both records."""
     settings = _settings_across(first, across)
     candidates: dict[Any, list[tuple[int, Record]]] = {}
     for place, group in enumerate(second):
         for record in group.records:
             candidates.setdefault(episode_key(record, across), []).append((place, record))
     for group in first:
-        can_pair = [can_compare(group, other, settings) for other in second]
+        joined = {
+            place: _join(group, other)
+            for place, other in enumerate(second)
+            if can_compare(group, other, settings)
+        }
         for record in group.records:
             of_episode = candidates.get(episode_key(record, across), [])
-            places = [place for place, (number, _) in enumerate(of_episode) if can_pair[number]]
+            places = [place for place, (number, _) in enumerate(of_episode) if number in joined]
             if places:
-                yield group, (record, of_episode.pop(places[0])[1])
+                number, other = of_episode.pop(places[0])
+                yield joined[number], (record, other)
+
+
+def _join(first: Group, second: Group) -> Settings:
+    """Return the settings of both groups; what only one recorded holds for both."""
+    joined = {}
+    for name in first.settings | second.settings:
+        values = dict.fromkeys(each.settings.get(name, ABSENT) for each in (first, second))
+        joined[name] = " and ".join(value for value in values if value != NOT_RECORDED) or NOT_RECORDED
+    return joined
 
 
 def _settings_across(groups: list[Group], across: str | None) -> tuple[str, ...]:
