@@ -11,7 +11,7 @@ from lerobot_bomb.results.pairs import Pair, PairedComparison, compare_pairs, de
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.stats import format_p
 
-ABSENT = "none"  # value of a setting that a record lacks, as the version of SAPIEN
+ABSENT = "none"  # value of a setting that a record lacks: SAPIEN of MuJoCo's, a flag that is null
 
 type Values = dict[str, set[str]]  # of settings
 type Settings = dict[str, str]  # {name: the value in a pair, or both values}
@@ -222,8 +222,8 @@ def _settings_across(groups: list[Group], across: str | None) -> tuple[str, ...]
 
 def _values_of(groups: list[Group]) -> Values:
     """Return {setting: its values in these groups}."""
-    names = groups[0].settings
-    return {name: {group.settings.get(name, NOT_RECORDED) for group in groups} for name in names}
+    names = {name: None for group in groups for name in group.settings}
+    return {name: {group.settings.get(name, ABSENT) for group in groups} for name in names}
 
 
 def _apart(first: Values, second: Values, across: Collection[str] = ()) -> list[str]:
@@ -231,13 +231,12 @@ def _apart(first: Values, second: Values, across: Collection[str] = ()) -> list[
 
     A setting that was not recorded keeps no episodes apart: an expert is shown no image, so OpenGL drew none.
     """
-    return [
-        name
-        for name, values in first.items()
-        if name not in (POLICY, *across)
-        and not values & second.get(name, set())
-        and NOT_RECORDED not in values | second.get(name, set())
-    ]
+    apart = []
+    for name in first | second:
+        values, others = first.get(name, {ABSENT}), second.get(name, {ABSENT})
+        if name not in (POLICY, *across) and not values & others and NOT_RECORDED not in values | others:
+            apart.append(name)
+    return apart
 
 
 def _why_none(first: list[Group], second: list[Group], across: str | None) -> str:
