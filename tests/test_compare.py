@@ -129,6 +129,21 @@ def test_every_condition_must_reach_the_bar(a: Path, b: Path) -> None:
     assert compare(a, b, "--non_inferior=5") == ANSWER_IS_NO
 
 
+def test_a_condition_without_pairs_is_not_shown(a: Path, b: Path, capsys: Printed) -> None:
+    write(a, ["dropped"] * 50)
+    write(b, [None] * 50, policy=FDVLA)
+    assert compare(a, b, "--non_inferior=5", "--min_difference=50") == 0
+    write(a, [None] * 3, "light:3")
+    write(a, [None] * 50, image_size=64)
+    for files, side in (((a, b), "A"), ((b, a), "B")):
+        capsys.readouterr()
+        assert compare(*files, "--non_inferior=100", "--min_difference=0") == ANSWER_IS_NO
+        out = capsys.readouterr().out
+        lacking = f"no pairs under image_size 256, light:3 and image_size 64, none of {side}"
+        assert out.count(f"points: not shown ({lacking})") == 1
+        assert f"; {lacking}\n" in out
+
+
 def test_what_is_measured_is_compared_where_both_have_it(a: Path, b: Path, capsys: Printed) -> None:
     write(a, ["never_reached", *[None] * 4], error=1.0)
     write(b, [None] * 5, error=3.5, policy=FDVLA)

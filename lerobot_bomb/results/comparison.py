@@ -2,14 +2,16 @@
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import Any
 
-from lerobot_bomb.results.groups import POLICY, Group, groups_of, rate_of
+from lerobot_bomb.results.groups import POLICY, Group, by_condition, differing, groups_of, rate_of
 from lerobot_bomb.results.names import policy_names
 from lerobot_bomb.results.origin import NOT_RECORDED
 from lerobot_bomb.results.pairs import Pair, PairedComparison, compare_pairs, describe_test, episode_key
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.stats import format_p
+from lerobot_bomb.tables import in_a_row
 
 ABSENT = "none"  # value of a setting that a record lacks: SAPIEN of MuJoCo's, a flag that is null
 
@@ -25,11 +27,25 @@ class Comparisons:
     names: tuple[str, str]  # the shortest that tell them apart
     conditions: list[PairedComparison]
     num_unpaired: tuple[int, int]  # episodes that the other policy did not run
+    unpaired: tuple[list[str], list[str]]  # conditions none of whose episodes the other policy ran
 
     @property
-    def lowest(self) -> float:
-        """Lowest end of all intervals: the second policy is better by at least that under every condition."""
-        return min(each.interval[0] for each in self.conditions)
+    def lowest(self) -> tuple[float, str]:
+        """Points by which B is better at least, under every condition, and how they are known.
+
+        -inf if they are not: a condition lacks pairs.
+        """
+        if lacking := self.without_pairs:
+            return -inf, lacking
+        low = 100 * min(each.interval[0] for each in self.conditions)
+        return low, f"lowest end of an interval {low:+.1f}"
+
+    @property
+    def without_pairs(self) -> str:
+        """Text 'no pairs under camera:3 of A'; '' if each condition of both has some."""
+        lacking = zip("AB", self.unpaired, strict=True)
+        told = [f"{in_a_row(conditions)} of {side}" for side, conditions in lacking if conditions]
+        return f"no pairs under {in_a_row(told)}" if told else ""
 
     def verdicts(self) -> list[str]:
         """Say under which conditions which policy is better."""
@@ -54,7 +70,8 @@ class Comparisons:
             lines += [f"{each.condition}: {_num_pairs(each)}", *(f"  {line}" for line in _lines(each))]
         if any(self.num_unpaired):
             a, b = self.num_unpaired
-            lines.append(f"not compared, since only one has them: {a} episodes of A, {b} of B")
+            told = f"not compared, since only one has them: {a} episodes of A, {b} of B"
+            lines.append("; ".join(filter(None, [told, self.without_pairs])))
         notes = (
             "rates: 95 % Wilson intervals, clustered by seed; B - A: Newcombe's for pairs; p: "
             f"{describe_test(len(self.conditions))}, to be trusted where the two disagree, as with few pairs"
@@ -134,11 +151,13 @@ def compare(
     if not pairs:
         raise ValueError(f"no episode is in both: {_why_none(*groups, across)}")
     num_first, num_second = (sum(len(group.records) for group in policy_groups) for policy_groups in groups)
+    first_paired, second_paired = ({id(pair[side]) for _, pair in pairs} for side in (0, 1))
     return Comparisons(
         policies=policies,
         names=_names(groups[0][0], groups[1][0], names, across),
         conditions=compare_pairs(_by_condition(pairs)),
         num_unpaired=(num_first - len(pairs), num_second - len(pairs)),
+        unpaired=(_unpaired(groups[0], first_paired), _unpaired(groups[1], second_paired)),
     )
 
 
@@ -172,6 +191,17 @@ def _condition_label(names: Iterable[str], values: Settings, perturbations: str)
     return ", ".join(
         [*(value if name == "suite" else f"{name} {value}" for name, value in shown), perturbations]
     )
+
+
+def _unpaired(groups: list[Group], paired: set[int]) -> list[str]:
+    """Return the conditions of groups of which no record, by its id, has a pair."""
+    several = differing(groups)
+    return [
+        _condition_label(several, group.settings, condition)
+        for group in groups
+        for condition, records in by_condition(group.records).items()
+        if paired.isdisjoint(map(id, records))
+    ]
 
 
 def _only_policy(name: str, groups: list[Group]) -> str:
