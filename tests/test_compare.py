@@ -94,7 +94,7 @@ def test_renderers_of_either_side_are_compared_apart(a: Path, b: Path, capsys: P
     for files in ((a, b), (b, a)):
         assert compare(*files) == 0
         out = capsys.readouterr().out
-        assert "OpenGL llvmpipe, llvmpipe, none: 1 pairs" in out and "OpenGL H200, H200, none: 1 pairs" in out
+        assert "OpenGL llvmpipe, llvmpipe, none: 1 pair" in out and "OpenGL H200, H200, none: 1 pair" in out
 
 
 def test_pairs_that_share_seeds_are_said_to(a: Path, b: Path, capsys: Printed) -> None:
@@ -107,7 +107,28 @@ def test_pairs_that_share_seeds_are_said_to(a: Path, b: Path, capsys: Printed) -
                 ]
                 file.writelines(json.dumps(line | {"policy": asdict(policy)}) + "\n" for line in lines)
     assert compare(a, b) == 0
-    assert "none: 4 pairs of 2 seeds, which B - A and p take as independent" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "none: 4 pairs of 2 seeds\n" in out and "(Holm)" not in out
+    assert "not adjusted, which takes pairs of one seed as independent\n" in out
+
+
+def test_tasks_of_one_seed_show_nothing(a: Path, b: Path, capsys: Printed) -> None:
+    numbers = range(20)
+    for seed, expected in ((0, ANSWER_IS_NO), (1, 0)):
+        for path, policy, failure in ((a, ACT, "dropped"), (b, FDVLA, None)):
+            with path.open("a") as file:
+                for task in numbers:
+                    spec = {"target": divmod(task, 5), "color": "black"}
+                    line = values(seed, failure, policy=policy, spec=spec, task_ids=[*numbers])
+                    file.write(json.dumps(line) + "\n")
+        output = a.with_suffix(".tex")
+        assert compare(a, b, "--min_difference=5", "--non_inferior=5", f"--output={output}") == expected
+        if seed == 0:
+            assert "& $+100.0$ &" in output.read_text()
+            out = capsys.readouterr().out
+            assert "not shown: B leads by 100 points (20 pairs of 1 seed, p = 1.9e-06)" in out
+            assert out.count("points or more: not shown (all pairs are of one seed under none)") == 1
+    assert "B - A      +100.0 points [+7.0, +100.0]" in capsys.readouterr().out  # as of two pairs
 
 
 def test_the_exit_code_says_whether_a_difference_is_shown(a: Path, b: Path, capsys: Printed) -> None:

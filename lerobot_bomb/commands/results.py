@@ -26,8 +26,9 @@ from lerobot_bomb.stats import format_p
 from lerobot_bomb.tables import print_lines, print_table, shorten
 
 LEGEND = (
-    "success: with 95 % Wilson interval, clustered by seed; change: points, with 95 % interval, from the",
-    "same episodes unperturbed; p: exact McNemar test, to be trusted where interval and p disagree",
+    "success: with 95 % Wilson interval; change: points, with 95 % interval, from the same episodes",
+    "unperturbed; both clustered by seed; p: exact McNemar test of independent pairs; where interval and p",
+    "disagree, trust p, but the interval where pairs share seeds",
 )
 WORDS = ("policy", "suite", "condition")  # columns at the left
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 from lerobot_bomb.files import file_names
-from lerobot_bomb.report.cells import INTERVALS
+from lerobot_bomb.report.cells import INTERVALS, PAIRED_INTERVAL
 from lerobot_bomb.report.panels import Panel, Series, panels_of
 from lerobot_bomb.results.comparison import Comparisons, compare
 from lerobot_bomb.results.groups import (
@@ -56,7 +56,7 @@ def comparison_table(comparisons: Comparisons) -> str:
     a, b = (_escaped(shorten(name)) for name in comparisons.names)
     caption = (
         f"{_where(groups, f' of {a} (A) and {b} (B)')}. B $-$ A: in points, on the same episodes, with "
-        rf"Newcombe's 95 \% interval for pairs; $p$: {_escaped(describe_test(len(conditions)))}. "
+        f"{_escaped(PAIRED_INTERVAL)}; $p$: {_escaped(describe_test(conditions))}. "
         f"Bold: better, $p < {SIGNIFICANT}$. {_simulated(groups)}"
     )
     header = [_line("condition", "A", "B", "B $-$ A", "$p$", "pairs")]
@@ -67,11 +67,11 @@ def _compared_line(compared: PairedComparison) -> str:
     difference = compared.counts.difference
     is_better = compared.is_shown and difference < 0, compared.is_shown and difference > 0
     rates = [rate_of(list(records)) for records in zip(*compared.pairs, strict=True)]
-    low, high = compared.interval
+    interval = "" if compared.interval is None else f" [{', '.join(map(_points, compared.interval))}]"
     return _line(
         _escaped(compared.condition),
         *map(_rate, rates, is_better),
-        f"{_points(difference)} [{_points(low)}, {_points(high)}]",
+        f"{_points(difference)}{interval}",
         _p(compared.p_value),
         str(compared.counts.n),
     )
@@ -193,9 +193,8 @@ def _caption(panel: Panel, apart: list[str], is_bold: bool) -> str:
     changes = [change for each in panel.series for change in each.costs.values()]
     parts = [f"{_where(groups)}."]
     if changes:
-        numbers = {each.num_conditions for each in changes}
-        test = describe_test(numbers.pop()) if len(numbers) == 1 else "exact McNemar test, adjusted (Holm)"
-        parts.append(f"Change: in points, from the same episodes unperturbed; $p$: {_escaped(test)}.")
+        test = _escaped(describe_test(changes))
+        parts.append(f"Change: in points, from the same episodes unperturbed; $p$: {test}.")
     if len(groups) > 1:
         test = f"$p < {SIGNIFICANT}$, exact McNemar test on the same episodes, adjusted for conditions (Holm)"
         claim = "Bold: better" if is_bold else "Under no condition is a policy shown to be better"

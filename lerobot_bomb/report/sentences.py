@@ -137,7 +137,7 @@ def _no_difference(others: Sequence[PairedComparison], kind: str) -> str:
 
 
 def _unit(compared: PairedComparison) -> str:
-    return "seeds" if compared.num_starts == len(compared.pairs) else "pairs of episodes"
+    return "pairs of episodes" if compared.is_clustered else "seeds"
 
 
 def describe_ranking(panel: Panel) -> Iterator[Statement]:

@@ -8,9 +8,16 @@ from typing import Any
 from lerobot_bomb.results.groups import POLICY, Group, by_condition, differing, groups_of, rate_of
 from lerobot_bomb.results.names import policy_names
 from lerobot_bomb.results.origin import NOT_RECORDED
-from lerobot_bomb.results.pairs import Pair, PairedComparison, compare_pairs, describe_test, episode_key
+from lerobot_bomb.results.pairs import (
+    Pair,
+    PairedComparison,
+    are_clustered,
+    compare_pairs,
+    describe_test,
+    episode_key,
+)
 from lerobot_bomb.results.record import Record
-from lerobot_bomb.stats import format_p
+from lerobot_bomb.stats import format_bounds, format_p
 from lerobot_bomb.tables import in_a_row
 
 ABSENT = "none"  # value of a setting that a record lacks: SAPIEN of MuJoCo's, a flag that is null
@@ -33,11 +40,13 @@ class Comparisons:
     def lowest(self) -> tuple[float, str]:
         """Points by which B is better at least, under every condition, and how they are known.
 
-        -inf if they are not: a condition lacks pairs.
+        -inf if they are not: a condition has no pairs, or all its pairs are of one start.
         """
         if lacking := self.without_pairs:
             return -inf, lacking
-        low = 100 * min(each.interval[0] for each in self.conditions)
+        if of_one_seed := [each.condition for each in self.conditions if each.interval is None]:
+            return -inf, f"all pairs are of one seed under {in_a_row(of_one_seed)}"
+        low = 100 * min(each.interval[0] for each in self.conditions if each.interval is not None)
         return low, f"lowest end of an interval {low:+.1f}"
 
     @property
@@ -73,34 +82,36 @@ class Comparisons:
             told = f"not compared, since only one has them: {a} episodes of A, {b} of B"
             lines.append("; ".join(filter(None, [told, self.without_pairs])))
         notes = (
-            "rates: 95 % Wilson intervals, clustered by seed; B - A: Newcombe's for pairs; p: "
-            f"{describe_test(len(self.conditions))}, to be trusted where the two disagree, as with few pairs"
+            "rates: 95 % Wilson intervals, clustered by seed; B - A: Newcombe's for pairs, likewise; p: "
+            f"{describe_test(self.conditions)}"
         )
+        if not are_clustered(self.conditions):
+            notes += ", to be trusted where the two disagree, as with few pairs"
         return [*lines, notes]
 
 
 def describe_verdict(compared: PairedComparison, first: str = "A", second: str = "B") -> str:
     """Return 'B is better by 28 points [12, 43] (40 pairs, p = 0.0068)', or that this is not significant."""
     counts = compared.counts
-    pairs = f"{counts.n} pair{'s' * (counts.n != 1)}"
+    pairs = _num_pairs(compared)
     if counts.difference == 0:
         return f"they tie ({counts.first} success{'es' * (counts.first != 1)} each in {pairs})"
-    low, high = compared.interval
-    better, low, high = (first, -high, -low) if counts.difference < 0 else (second, low, high)
-    points = f"{100 * abs(counts.difference):.0f} points [{100 * low:.0f}, {100 * high:.0f}]"
+    better, interval = second, compared.interval
+    if counts.difference < 0:
+        better, interval = first, interval and (-interval[1], -interval[0])
+    points = f"{100 * abs(counts.difference):.0f} points{format_bounds(interval, '.0f', 100)}"
     test = f"{pairs}, {format_p(compared.p_value)}"
     if compared.is_shown:
         return f"{better} is better by {points} ({test})"
     needed = f"; about {compared.num_needed:,} pairs would settle it" if compared.num_needed else ""
-    return f"not significant: {better} leads by {points} ({test}{needed})"
+    why = "not shown" if compared.is_significant else "not significant"
+    return f"{why}: {better} leads by {points} ({test}{needed})"
 
 
 def _num_pairs(compared: PairedComparison) -> str:
-    if compared.num_starts == len(compared.pairs):
-        return f"{len(compared.pairs)} pairs"
-    return (
-        f"{len(compared.pairs)} pairs of {compared.num_starts} seeds, which B - A and p take as independent"
-    )
+    of_seeds = f" of {compared.num_starts} seed{'s' * (compared.num_starts != 1)}"
+    number = len(compared.pairs)
+    return f"{number} pair{'s' * (number != 1)}{of_seeds * compared.is_clustered}"
 
 
 def _lines(compared: PairedComparison) -> list[str]:
