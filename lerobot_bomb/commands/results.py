@@ -138,8 +138,8 @@ def _print_details(told: FileGroups) -> None:
             version = group.records[0].protocol_version
             lacking = ", ".join(group.missing_fields)
             print(f"{path}: records of protocol {version} lack {lacking}")
-        if group.num_replaced:
-            print(f"{path}: {group.num_replaced} records are replaced by later ones of the same episode")
+        if group.replaced:
+            print(f"{path}: {group.replaced}")
         conditions = by_condition(group.records)
         for condition, records in conditions.items():
             label = f" (perturbations={condition})" if len(conditions) > 1 else ""

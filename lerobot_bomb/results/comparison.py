@@ -74,7 +74,8 @@ class Comparisons:
         a, b = self.names
         lines = [f"A is {a}, B is {b}", *self.verdicts(), ""]
         lines += [f"{name}: {policy}" for name, policy in zip("AB", self.policies, strict=True)]
-        lines += ["A and B are the same policy"] if self.policies[0] == self.policies[1] else []
+        is_same = self.policies[0] == self.policies[1] != NOT_RECORDED
+        lines += ["A and B are the same policy"] if is_same else []
         for each in self.conditions:
             lines += [f"{each.condition}: {_num_pairs(each)}", *(f"  {line}" for line in _lines(each))]
         if any(self.num_unpaired):
