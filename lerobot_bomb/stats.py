@@ -163,6 +163,11 @@ def format_p(p_value: float) -> str:
     return f"p = {p_value:.2g}" if p_value >= SMALLEST_P else f"p < {SMALLEST_P:g}"
 
 
+def points_format(difference: float) -> str:
+    """Return the format of a difference of rates in percentage points: a decimal for less than one point."""
+    return ".1f" if 0 < abs(difference) < 0.01 else ".0f"
+
+
 @dataclass(frozen=True)
 class PairedCounts:
     """Counts of paired episodes by which of the two groups succeeded."""

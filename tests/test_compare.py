@@ -76,6 +76,13 @@ def test_the_number_of_pairs_is_one_in_which_the_test_that_is_used_finds_the_dif
     assert "p: exact McNemar test, adjusted for 2 conditions (Holm)" in out
 
 
+def test_less_than_a_point_has_a_decimal(a: Path, b: Path, capsys: Printed) -> None:
+    write(a, ["dropped"] * 2 + [None] * 248)
+    write(b, [None] * 250, policy=FDVLA)
+    assert compare(a, b) == 0
+    assert "B leads by 0.8 points [-0.8, 2.9] (250 pairs" in capsys.readouterr().out
+
+
 def test_what_must_not_be_pooled_is_compared_apart(a: Path, b: Path, capsys: Printed) -> None:
     for image_size, failure in ((256, None), (64, "dropped")):
         write(a, [None] * 3, image_size=image_size)

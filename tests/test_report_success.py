@@ -54,6 +54,11 @@ def test_a_policy_is_told_in_one_sentence_that_is_true_for_its_number_of_episode
     ]
 
 
+def test_a_loss_below_a_point_is_no_zero(report: Callable[..., dict[str, Any]]) -> None:
+    section = report(perturbed({"none": outcomes(200, 200), "light:3": outcomes(199, 200)}))["Success"]
+    assert "(no difference shown: 0.5 points less, p = 1)" in section["statements"][0]
+
+
 def test_one_episode_is_one_episode(report: Callable[..., dict[str, Any]]) -> None:
     sections = report([values(0)])
     assert sections["Success"]["statements"] == [

@@ -9,7 +9,7 @@ from lerobot_bomb.report.table import Statement
 from lerobot_bomb.results.comparison import Comparisons, describe_verdict
 from lerobot_bomb.results.groups import rate_of, settings_of
 from lerobot_bomb.results.pairs import PairedComparison
-from lerobot_bomb.stats import Rate, format_p
+from lerobot_bomb.stats import Rate, format_p, points_format
 from lerobot_bomb.tables import first_of, in_a_row, shorten
 
 MAX_NAMED = 3  # names in a sentence
@@ -68,10 +68,14 @@ def _change(compared: PairedComparison) -> str:
 
 
 def _points(compared: PairedComparison) -> str:
-    points = 100 * compared.counts.difference
-    if points == 0:
+    difference = compared.counts.difference
+    if difference == 0:
         return "no change"
-    return f"{abs(points):.0f} points {'less' if points < 0 else 'more'}"
+    return f"{_num_points(difference)} {'less' if difference < 0 else 'more'}"
+
+
+def _num_points(difference: float) -> str:
+    return f"{100 * abs(difference):{points_format(difference)}} points"
 
 
 def _costs(series: Series) -> Iterator[str]:
@@ -195,8 +199,8 @@ def _perturbed_verdict(found: Sequence[PairedComparison], first: str, second: st
         if better:
             most = max(better, key=lambda each: sign * each.counts.difference)
             condition = most.pairs[0][0].spec.perturbations
-            points = 100 * abs(most.counts.difference)
+            points = _num_points(most.counts.difference)
             is_better = f"{name} is significantly better under {len(better)}"
-            parts.append(f"{is_better}, most under {condition} (by {points:.0f} points)")
+            parts.append(f"{is_better}, most under {condition} (by {points})")
     told = in_a_row(parts) if parts else "none shows a significant difference"
     return f"Of {len(found):,} perturbed conditions, {told}."

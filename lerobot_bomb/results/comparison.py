@@ -17,7 +17,7 @@ from lerobot_bomb.results.pairs import (
     episode_key,
 )
 from lerobot_bomb.results.record import Record
-from lerobot_bomb.stats import format_bounds, format_p
+from lerobot_bomb.stats import format_bounds, format_p, points_format
 from lerobot_bomb.tables import in_a_row
 
 ABSENT = "none"  # value of a setting that a record lacks: SAPIEN of MuJoCo's, a flag that is null
@@ -100,7 +100,8 @@ def describe_verdict(compared: PairedComparison, first: str = "A", second: str =
     better, interval = second, compared.interval
     if counts.difference < 0:
         better, interval = first, interval and (-interval[1], -interval[0])
-    points = f"{100 * abs(counts.difference):.0f} points{format_bounds(interval, '.0f', 100)}"
+    form = points_format(counts.difference)
+    points = f"{100 * abs(counts.difference):{form}} points{format_bounds(interval, form, 100)}"
     test = f"{pairs}, {format_p(compared.p_value)}"
     if compared.is_shown:
         return f"{better} is better by {points} ({test})"
