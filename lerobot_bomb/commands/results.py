@@ -23,7 +23,7 @@ from lerobot_bomb.results.groups import (
 )
 from lerobot_bomb.results.summary import describe_unpaired, pair_lines, summarise
 from lerobot_bomb.stats import format_p
-from lerobot_bomb.tables import print_lines, print_table, shorten
+from lerobot_bomb.tables import print_lines, print_table, shorten_all
 
 LEGEND = (
     "success: with 95 % Wilson interval; change: points, with 95 % interval, from the same episodes",
@@ -78,10 +78,11 @@ def _print_rates(told: list[FileGroups]) -> None:
     """Print a line for each group and condition."""
     several = len(told) > 1
     apart = [*{name: None for each in told for name in differing_otherwise(each.groups)}]
+    names = shorten_all(group.policy for each in told for group in each.groups)
     rows = [
         [
             *([str(each.file.path)] if several else []),
-            *(shorten(group.policy), suite_of(group), *(_setting(group, name) for name in apart)),
+            *(names[group.policy], suite_of(group), *(_setting(group, name) for name in apart)),
             *cells,
         ]
         for each in told
@@ -113,6 +114,7 @@ def _setting(group: Group, name: str) -> str:
 
 def _notes(told: list[FileGroups]) -> Iterator[str]:
     """Yield what is damaged, not compared, or kept apart."""
+    names = shorten_all(group.name for each in told for group in each.groups)
     for each in told:
         path = each.file.path
         if each.file.num_damaged:
@@ -121,7 +123,7 @@ def _notes(told: list[FileGroups]) -> Iterator[str]:
             yield f"{path}: episodes that differ in {', '.join(apart)} are neither pooled nor paired"
         for group in each.groups:
             if unpaired := describe_unpaired(group, each.groups):
-                yield f"{path}: {shorten(group.name)}: {unpaired}"
+                yield f"{path}: {names[group.name]}: {unpaired}"
 
 
 def _print_details(told: FileGroups) -> None:

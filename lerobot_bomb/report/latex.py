@@ -21,7 +21,7 @@ from lerobot_bomb.results.groups import (
 from lerobot_bomb.results.pairs import PairedComparison, describe_test
 from lerobot_bomb.results.record import describe_numbers
 from lerobot_bomb.stats import SIGNIFICANT, Rate
-from lerobot_bomb.tables import printable, shorten
+from lerobot_bomb.tables import printable, shorten_all
 
 SPECIAL = {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
@@ -53,7 +53,8 @@ def comparison_table(comparisons: Comparisons) -> str:
     """Write a `table` of two policies on the same episodes; the better in bold."""
     conditions = comparisons.conditions
     groups = groups_of(record for each in conditions for pair in each.pairs for record in pair)
-    a, b = (_escaped(shorten(name)) for name in comparisons.names)
+    short = shorten_all(comparisons.names)
+    a, b = (_escaped(short[name]) for name in comparisons.names)
     caption = (
         f"{_where(groups, f' of {a} (A) and {b} (B)')}. B $-$ A: in points, on the same episodes, with "
         f"{_escaped(PAIRED_INTERVAL)}; $p$: {_escaped(describe_test(conditions))}. "
@@ -133,17 +134,18 @@ def _written(panel: Panel, label: str, apart: list[str], wins: Wins) -> str:
     }
     write = _beside if len(panel.series) <= MAX_BESIDE else _below
     caption = _caption(panel, apart, is_bold=bool(best))
-    return _float(caption, label, *write(panel.series, conditions, columns, cells))
+    return _float(caption, label, *write(panel, conditions, columns, cells))
 
 
 type _Cells = dict[tuple[str, str], list[str]]  # of a group's name and a condition
 
 
 def _beside(
-    several: list[Series], conditions: list[str], columns: list[str], cells: _Cells
+    panel: Panel, conditions: list[str], columns: list[str], cells: _Cells
 ) -> tuple[str, list[str], list[str]]:
     """Return alignment, header and lines of a table with the policies beside each other."""
-    names, width = [*map(_name, several)], len(columns)
+    several, width = panel.series, len(columns)
+    names = [_name(each, panel) for each in several]
     header = [_line("condition", *names)] if width == 1 else _spanned(names, columns)
     lines = [
         _line(_escaped(condition), *(cell for each in several for cell in cells[each.group.name, condition]))
@@ -162,21 +164,21 @@ def _spanned(names: list[str], columns: list[str]) -> list[str]:
 
 
 def _below(
-    several: list[Series], conditions: list[str], columns: list[str], cells: _Cells
+    panel: Panel, conditions: list[str], columns: list[str], cells: _Cells
 ) -> tuple[str, list[str], list[str]]:
     """Return alignment, header and lines of a table with the policies below each other."""
     lines: list[str] = []
     for condition in conditions:
-        having = [each for each in several if condition in each.rates]
+        having = [each for each in panel.series if condition in each.rates]
         lines += [r"\addlinespace"] if lines else []
         for place, each in enumerate(having):
             first = "" if place else _escaped(condition)
-            lines.append(_line(first, _name(each), *cells[each.group.name, condition]))
+            lines.append(_line(first, _name(each, panel), *cells[each.group.name, condition]))
     return "ll" + "r" * len(columns), [_line("condition", "policy", *columns)], lines
 
 
-def _name(series: Series) -> str:
-    return _escaped(shorten(series.policy))
+def _name(series: Series, panel: Panel) -> str:
+    return _escaped(panel.short_names[series.policy])
 
 
 def _cells(series: Series, condition: str, best: set[tuple[str, str]], number: int) -> list[str]:

@@ -10,6 +10,7 @@ from lerobot_bomb.results.groups import PER_TASK, POLICY, Group, by_condition, d
 from lerobot_bomb.results.pairs import PairedComparison, compare_pairs, pair_with_nominal
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.stats import Rate
+from lerobot_bomb.tables import shorten_all
 
 MAX_CONDITIONS = 24  # that a chart can show below each other
 MAX_SETTING = 24  # characters of a setting in the name of a panel
@@ -62,6 +63,11 @@ class Panel:
 
     name: str  # 'place'; '' if there is nothing to tell
     series: list[Series]
+
+    @cached_property
+    def short_names(self) -> dict[str, str]:
+        """Names of the policies as sentences and tables show them."""
+        return shorten_all(each.policy for each in self.series)
 
     @cached_property
     def conditions(self) -> list[AxisCondition]:

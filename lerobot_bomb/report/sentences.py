@@ -10,7 +10,7 @@ from lerobot_bomb.results.comparison import Comparisons, describe_verdict
 from lerobot_bomb.results.groups import rate_of, settings_of
 from lerobot_bomb.results.pairs import PairedComparison
 from lerobot_bomb.stats import Rate, format_p, points_format
-from lerobot_bomb.tables import first_of, in_a_row, shorten
+from lerobot_bomb.tables import first_of, in_a_row
 
 MAX_NAMED = 3  # names in a sentence
 MAX_PLACES = 6  # of a ranking
@@ -154,7 +154,7 @@ def describe_ranking(panel: Panel) -> Iterator[Statement]:
     rates = {each.policy: rate_of(shared) for each, shared in zip(panel.series, records, strict=True)}
     tied: dict[float, list[str]] = {}
     for each in panel.ranked:
-        tied.setdefault(rates[each.policy].share, []).append(shorten(each.policy))
+        tied.setdefault(rates[each.policy].share, []).append(panel.short_names[each.policy])
     places = [
         f"{in_a_row(first_of(names, MAX_NAMED))} {'tie at ' if len(names) > 1 else ''}{100 * share:.0f} %"
         for share, names in tied.items()
@@ -170,17 +170,17 @@ def _why_not_ranked(panel: Panel) -> str:
     specs = {each.policy: {record.spec for record in each.group.records} for each in panel.series}
     for first, second in combinations(specs, 2):
         if specs[first].isdisjoint(specs[second]):
-            return f"{shorten(first)} and {shorten(second)} have no episode in common"
+            return f"{panel.short_names[first]} and {panel.short_names[second]} have no episode in common"
     return "no episode was run by all policies, though each two of them have some in common"
 
 
-def describe_comparison(first: Series, second: Series, compared: Comparisons) -> Statement:
+def describe_comparison(panel: Panel, first: Series, second: Series, compared: Comparisons) -> Statement:
     """Say which of two policies of a panel is better, and under which conditions."""
     settings = first.group.settings, second.group.settings
     found = [each for each in compared.conditions if tuple(map(settings_of, each.pairs[0])) == settings]
     nominal = [each for each in found if each.pairs[0][0].spec.perturbations == NONE]
     others = [each for each in found if each.pairs[0][0].spec.perturbations != NONE]
-    names = shorten(first.policy), shorten(second.policy)
+    names = panel.short_names[first.policy], panel.short_names[second.policy]
     parts = [f"unperturbed, {describe_verdict(each, *names)}." for each in nominal]
     if len(others) == 1:
         under = f"{'U' if parts else 'u'}nder {others[0].pairs[0][0].spec.perturbations}"

@@ -46,7 +46,7 @@ def _statements(report: Report, panel: Panel) -> list[Statement]:
         first, second = sorted((told[0], other), key=lambda each: each.place)
         compared = report.compared(first.policy, second.policy)
         if compared is not None:
-            found.append(describe_comparison(first, second, compared))
+            found.append(describe_comparison(panel, first, second, compared))
     return found + [describe_series(each, panel) for each in told]
 
 
