@@ -30,7 +30,7 @@ def policy_names(
     """
     known = [each or PolicyIdentity(UNKNOWN) for each in policies]
     names = [shipped_name(each.path or "") or each.type for each in known]
-    for parts in (_path_parts, _interventions, _weights, _settings):
+    for parts in (_path_parts, _interventions, _steps, _weights, _settings):
         names = _extended(names, known, parts)
     chosen = given or {}
     return numbered([chosen.get(policy_key(each), name) for each, name in zip(policies, names, strict=True)])
@@ -75,6 +75,11 @@ def _path_parts(policies: Sequence[PolicyIdentity]) -> list[str]:
 
 def _interventions(policies: Sequence[PolicyIdentity]) -> list[str]:
     return [" ".join(f"with {name}" for name in each.interventions) for each in policies]
+
+
+def _steps(policies: Sequence[PolicyIdentity]) -> list[str]:
+    steps = [each.training_step for each in policies]
+    return ["" if step is None else f"step {step}" for step in steps]
 
 
 def _weights(policies: Sequence[PolicyIdentity]) -> list[str]:
