@@ -3,7 +3,6 @@
 The draws are always the same. Shapes: `R` frames, `E` episodes, `N` values, `M` sums of each episode.
 """
 
-from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -15,13 +14,6 @@ NUM_RESAMPLES = 2000
 NUM_BCA_RESAMPLES = 9999
 MAX_DRAWS = 2**20  # that are in memory at once
 ROUNDING = 1e-9  # that makes no two numbers different
-
-
-def sums_by(values_N: np.ndarray, episode_N: Sequence[Hashable]) -> tuple[np.ndarray, np.ndarray]:
-    """Sum and count values by episode: (sums_E, counts_E)."""
-    places: dict[Hashable, int] = {}
-    place_N = [places.setdefault(episode, len(places)) for episode in episode_N]
-    return np.bincount(place_N, weights=values_N), np.bincount(place_N).astype(float)
 
 
 def bootstrap_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float, float] | None:

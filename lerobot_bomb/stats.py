@@ -11,12 +11,20 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 Z_95 = NormalDist().inv_cdf(0.975)
 SIGNIFICANT = 0.05  # two-sided
 SMALLEST_P = 1e-99  # that is shown
 POWER = 0.8  # of the number of pairs that is advised
 MAX_PAIRS = 2**20  # that are advised
+
+
+def sums_by(values_N: ArrayLike, cluster_N: Sequence[Hashable]) -> tuple[np.ndarray, np.ndarray]:
+    """Sum and count values by cluster: (sums_C, counts_C)."""
+    places: dict[Hashable, int] = {}
+    place_N = [places.setdefault(cluster, len(places)) for cluster in cluster_N]
+    return np.bincount(place_N, weights=np.asarray(values_N)), np.bincount(place_N).astype(float)
 
 
 def wilson_interval(successes: int, n: int) -> tuple[float, float]:
@@ -48,20 +56,32 @@ def clustered_interval(successes_C: np.ndarray, counts_C: np.ndarray) -> tuple[f
     Source: Dean and Pagano (2015), "Evaluating confidence interval methods for binomial proportions in
     clustered surveys".
     """
+    rate = float(successes_C.sum() / counts_C.sum())
+    effective = _effective_number(successes_C, counts_C, rate * (1 - rate))
+    return None if effective is None else _wilson(rate, *effective)
+
+
+def _effective_number(
+    sums_C: np.ndarray, counts_C: np.ndarray, variance: float
+) -> tuple[float, float] | None:
+    """Return the effective number of independent records, and the quantile for a 95 % interval.
+
+    The values of a cluster's records have these sums, those of all records this variance. None for one
+    cluster of several records.
+    """
     num_clusters, n = len(counts_C), int(counts_C.sum())
     if num_clusters == n:
-        return wilson_interval(int(successes_C.sum()), n)
+        return n, Z_95
     if num_clusters == 1:
         return None
+    if variance == 0:  # nothing tells how alike the records of a cluster are: as if they were one
+        return num_clusters, Z_95
     from scipy.special import stdtrit
 
-    rate = successes_C.sum() / n
-    if rate in (0, 1):  # nothing tells how alike the records of a cluster are: as if they were one
-        return wilson_interval(int(rate) * num_clusters, num_clusters)
-    spread = ((successes_C - rate * counts_C) ** 2).sum() * num_clusters / (num_clusters - 1)
-    num_effective = n**2 * rate * (1 - rate) / spread if spread > 0 else n
-    num_effective = min(max(num_effective, num_clusters), n)
-    return _wilson(float(rate), float(num_effective), float(stdtrit(num_clusters - 1, 0.975)))
+    deviations_C = sums_C - sums_C.sum() / n * counts_C
+    spread = (deviations_C**2).sum() * num_clusters / (num_clusters - 1)
+    number = n**2 * variance / spread if spread > 0 else n
+    return float(min(max(number, num_clusters), n)), float(stdtrit(num_clusters - 1, 0.975))
 
 
 def format_bounds(interval: tuple[float, float] | None, form: str, unit: float = 1) -> str:
@@ -81,11 +101,9 @@ class Rate:
     @classmethod
     def of(cls, is_counted_N: Sequence[bool], cluster_N: Sequence[Hashable]) -> "Rate":
         """Compute the rate of one or more records; those of one cluster are not independent."""
-        places: dict[Hashable, int] = {}
-        place_N = [places.setdefault(cluster, len(places)) for cluster in cluster_N]
-        successes_C = np.bincount(place_N, weights=is_counted_N, minlength=len(places))
-        interval = clustered_interval(successes_C, np.bincount(place_N))
-        return cls(int(successes_C.sum()), len(is_counted_N), len(places), interval)
+        successes_C, counts_C = sums_by(is_counted_N, cluster_N)
+        interval = clustered_interval(successes_C, counts_C)
+        return cls(int(successes_C.sum()), len(is_counted_N), len(counts_C), interval)
 
     @property
     def share(self) -> float:
@@ -145,6 +163,11 @@ def format_p(p_value: float) -> str:
     return f"p = {p_value:.2g}" if p_value >= SMALLEST_P else f"p < {SMALLEST_P:g}"
 
 
+def points_format(difference: float) -> str:
+    """Return the format of a difference of rates in percentage points: a decimal for less than one point."""
+    return ".1f" if 0 < abs(difference) < 0.01 else ".0f"
+
+
 @dataclass(frozen=True)
 class PairedCounts:
     """Counts of paired episodes by which of the two groups succeeded."""
@@ -185,22 +208,23 @@ class PairedCounts:
         return mcnemar_p_value(self.only_first, self.only_second)
 
 
-def paired_difference_interval(counts: PairedCounts) -> tuple[float, float]:
+def paired_difference_interval(
+    counts: PairedCounts, number: float | None = None, z: float = Z_95
+) -> tuple[float, float]:
     """Return the 95 % interval of the second rate minus the first, in [-1, 1]; also for one pair.
 
+    `number`: the effective number of independent pairs, with its quantile `z`; by default, all are.
     Source: Newcombe (1998), "Improved confidence intervals for the difference between binomial proportions
     based on paired data", method 10: Wilson's intervals of both rates, joined by their correlation.
-
-    Raises:
-        ValueError: there are no pairs.
     """
     n, first, second = counts.n, counts.first, counts.second
-    (low_1, high_1), (low_2, high_2) = wilson_interval(first, n), wilson_interval(second, n)
+    number = n if number is None else number
     rate_1, rate_2 = first / n, second / n
+    (low_1, high_1), (low_2, high_2) = _wilson(rate_1, number, z), _wilson(rate_2, number, z)
     margins = first * second * (n - first) * (n - second)
     excess = counts.both * counts.neither - counts.only_first * counts.only_second
     if excess > 0:  # corrected for continuity, not beyond 0
-        excess = max(0.0, excess - n / 2)
+        excess = max(0.0, excess - n**2 / number / 2)
     correlation = excess / sqrt(margins) if margins else 0.0
 
     def half(a: float, b: float) -> float:
@@ -209,6 +233,21 @@ def paired_difference_interval(counts: PairedCounts) -> tuple[float, float]:
     low = half(rate_2 - low_2, high_1 - rate_1)
     high = half(high_2 - rate_2, rate_1 - low_1)
     return counts.difference - low, counts.difference + high
+
+
+def clustered_difference_interval(
+    counts: PairedCounts, differences_N: Sequence[int], cluster_N: Sequence[Hashable]
+) -> tuple[float, float] | None:
+    """Return the 95 % interval of the second rate minus the first; None for one cluster of several pairs.
+
+    `differences_N` is 1 for a pair in which only the second succeeded, -1 for only the first, else 0. The
+    interval is that of the effective number of independent pairs, as in `clustered_interval`. Unlike the
+    bootstrap over clusters, it holds the truth in 95 of 100 cases for few clusters, too.
+    """
+    sums_C, counts_C = sums_by(differences_N, cluster_N)
+    discordant = (counts.only_first + counts.only_second) / counts.n
+    effective = _effective_number(sums_C, counts_C, discordant - counts.difference**2)
+    return None if effective is None else paired_difference_interval(counts, *effective)
 
 
 def episodes_to_tell_apart(counts: PairedCounts, level: float = SIGNIFICANT) -> int | None:

@@ -18,6 +18,34 @@ def shorten(name: str, most: int = MAX_NAME) -> str:
     return f"{name[: most - 1 - last]}…{name[-last:]}"
 
 
+def shorten_all(names: Iterable[str], most: int = MAX_NAME) -> dict[str, str]:
+    """Return {name: the name of at most so many characters}; names that differ still do."""
+    return _shorten_from(0, dict.fromkeys(names), most)
+
+
+def _shorten_from(start: int, names: Iterable[str], most: int) -> dict[str, str]:
+    """Shorten names that are equal before `start`, of which only the first part is kept."""
+    alike: dict[str, list[str]] = {}
+    for name in names:
+        first = f"{name[: most // 3]}…" if start else ""
+        alike.setdefault(first + shorten(name[start:], most - len(first)), []).append(name)
+    short = {}
+    for text, several in alike.items():
+        is_alone = len(several) == 1
+        short |= {several[0]: text} if is_alone else _shorten_from(num_shared(several), several, most)
+    return short
+
+
+def num_shared(several: Sequence[Sequence[str]]) -> int:
+    """Return how many parts, or characters of texts, all begin with."""
+    number = 0
+    for parts in zip(*several, strict=False):
+        if len(set(parts)) > 1:
+            break
+        number += 1
+    return number
+
+
 def in_a_row(names: Sequence[str], last: str = "and") -> str:
     """Return 'a, b and c'; ``last``: the word before the last name."""
     return f" {last} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

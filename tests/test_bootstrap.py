@@ -10,9 +10,9 @@ from lerobot_bomb.bootstrap import (
     bootstrap_interval,
     fit_slope,
     paired_bootstrap_interval,
-    sums_by,
     variance_share,
 )
+from lerobot_bomb.stats import sums_by
 
 
 def ones(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -76,6 +76,13 @@ def test_the_number_of_pairs_is_one_in_which_the_test_that_is_used_finds_the_dif
     assert "p: exact McNemar test, adjusted for 2 conditions (Holm)" in out
 
 
+def test_less_than_a_point_has_a_decimal(a: Path, b: Path, capsys: Printed) -> None:
+    write(a, ["dropped"] * 2 + [None] * 248)
+    write(b, [None] * 250, policy=FDVLA)
+    assert compare(a, b) == 0
+    assert "B leads by 0.8 points [-0.8, 2.9] (250 pairs" in capsys.readouterr().out
+
+
 def test_what_must_not_be_pooled_is_compared_apart(a: Path, b: Path, capsys: Printed) -> None:
     for image_size, failure in ((256, None), (64, "dropped")):
         write(a, [None] * 3, image_size=image_size)
@@ -83,6 +90,18 @@ def test_what_must_not_be_pooled_is_compared_apart(a: Path, b: Path, capsys: Pri
     assert compare(a, b) == 0
     out = capsys.readouterr().out
     assert "image_size 256, none: 3 pairs" in out and "image_size 64, none: 3 pairs" in out
+
+
+def test_renderers_of_either_side_are_compared_apart(a: Path, b: Path, capsys: Printed) -> None:
+    for seed, renderer, failure in ((0, "llvmpipe", None), (1, "H200", "dropped")):
+        for path, policy, drawn in ((a, ACT, None), (b, FDVLA, renderer)):
+            line = values(seed, failure, policy=policy, opengl_vendor=drawn, opengl_renderer=drawn)
+            with path.open("a") as file:
+                file.write(json.dumps(line) + "\n")
+    for files in ((a, b), (b, a)):
+        assert compare(*files) == 0
+        out = capsys.readouterr().out
+        assert "OpenGL llvmpipe, llvmpipe, none: 1 pair" in out and "OpenGL H200, H200, none: 1 pair" in out
 
 
 def test_pairs_that_share_seeds_are_said_to(a: Path, b: Path, capsys: Printed) -> None:
@@ -95,7 +114,28 @@ def test_pairs_that_share_seeds_are_said_to(a: Path, b: Path, capsys: Printed) -
                 ]
                 file.writelines(json.dumps(line | {"policy": asdict(policy)}) + "\n" for line in lines)
     assert compare(a, b) == 0
-    assert "none: 4 pairs of 2 seeds, which B - A and p take as independent" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "none: 4 pairs of 2 seeds\n" in out and "(Holm)" not in out
+    assert "not adjusted, which takes pairs of one seed as independent\n" in out
+
+
+def test_tasks_of_one_seed_show_nothing(a: Path, b: Path, capsys: Printed) -> None:
+    numbers = range(20)
+    for seed, expected in ((0, ANSWER_IS_NO), (1, 0)):
+        for path, policy, failure in ((a, ACT, "dropped"), (b, FDVLA, None)):
+            with path.open("a") as file:
+                for task in numbers:
+                    spec = {"target": divmod(task, 5), "color": "black"}
+                    line = values(seed, failure, policy=policy, spec=spec, task_ids=[*numbers])
+                    file.write(json.dumps(line) + "\n")
+        output = a.with_suffix(".tex")
+        assert compare(a, b, "--min_difference=5", "--non_inferior=5", f"--output={output}") == expected
+        if seed == 0:
+            assert "& $+100.0$ &" in output.read_text()
+            out = capsys.readouterr().out
+            assert "not shown: B leads by 100 points (20 pairs of 1 seed, p = 1.9e-06)" in out
+            assert out.count("points or more: not shown (all pairs are of one seed under none)") == 1
+    assert "B - A      +100.0 points [+7.0, +100.0]" in capsys.readouterr().out  # as of two pairs
 
 
 def test_the_exit_code_says_whether_a_difference_is_shown(a: Path, b: Path, capsys: Printed) -> None:
@@ -115,6 +155,21 @@ def test_every_condition_must_reach_the_bar(a: Path, b: Path) -> None:
     write(a, [None] * 100, "light:3")
     write(b, ["dropped"] * 5 + [None] * 95, "light:3", policy=FDVLA)
     assert compare(a, b, "--non_inferior=5") == ANSWER_IS_NO
+
+
+def test_a_condition_without_pairs_is_not_shown(a: Path, b: Path, capsys: Printed) -> None:
+    write(a, ["dropped"] * 50)
+    write(b, [None] * 50, policy=FDVLA)
+    assert compare(a, b, "--non_inferior=5", "--min_difference=50") == 0
+    write(a, [None] * 3, "light:3")
+    write(a, [None] * 50, image_size=64)
+    for files, side in (((a, b), "A"), ((b, a), "B")):
+        capsys.readouterr()
+        assert compare(*files, "--non_inferior=100", "--min_difference=0") == ANSWER_IS_NO
+        out = capsys.readouterr().out
+        lacking = f"no pairs under image_size 256, light:3 and image_size 64, none of {side}"
+        assert out.count(f"points: not shown ({lacking})") == 1
+        assert f"; {lacking}\n" in out
 
 
 def test_what_is_measured_is_compared_where_both_have_it(a: Path, b: Path, capsys: Printed) -> None:

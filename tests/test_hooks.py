@@ -31,6 +31,7 @@ ON_FIRST_USE = {
     "lerobot.datasets.dataset_metadata.LeRobotDatasetMetadata.__init__",
     "lerobot.datasets.dataset_reader.DatasetReader._load_hf_dataset",
     "lerobot.policies.pretrained.PreTrainedPolicy.__init__",
+    "lerobot.scripts.lerobot_train.get_step_identifier",
     "lerobot.processor.pipeline.DataProcessorPipeline._build_steps_with_overrides",
     "sys.excepthook",
     "the filters of lerobot.utils.import_utils' logger",

@@ -14,11 +14,13 @@ from huggingface_hub import constants
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy, make_policy
 from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.scripts import lerobot_train
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
 from lerobot_bomb.checkpoints.acting import acting, acting_config, acting_policy
 from lerobot_bomb.checkpoints.identity import _of_checkpoint, identity_of, identity_of_config
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
+from lerobot_bomb.compat.hooks import evaluation
 from lerobot_bomb.compat.hooks import policies as built
 from lerobot_bomb.compat.hooks.policies import built_policies
 from lerobot_bomb.results.bomb import EpisodeResult
@@ -117,11 +119,18 @@ def test_a_flag_that_a_release_added_leaves_who_acts_as_it_was() -> None:
     assert identity_of_config(config).settings_sha256 != before
 
 
-def test_a_policy_in_training_does_not_claim_the_weights_it_started_from(checkpoint: Path) -> None:
+def test_a_policy_in_training_does_not_claim_the_weights_it_started_from(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     policy = loaded(checkpoint)
     meta = SimpleNamespace()
     setattr(policy.config, "_runtime_dataset_meta", meta)  # noqa: B010  as make_policy does for a dataset
+    monkeypatch.setattr(evaluation, "_STEPS", [])
     assert identity(policy) == PolicyIdentity("act", is_in_training=True)
+    evaluation.note_training_steps()
+    assert lerobot_train.get_step_identifier(7, 100) == "000007"
+    at_step = PolicyIdentity("act", is_in_training=True, training_step=7)
+    assert identity(policy) == at_step and at_step.describe() == "act (in training, step 7)"
 
 
 def test_scripted_and_untrained_policies_have_a_type_only() -> None:

@@ -20,6 +20,7 @@ from lerobot_bomb.results.pairs import compare_pairs
 
 CLASSES = (None, None, None, "imprecise", "wrong_intersection", "dropped")
 LEVELS = "Success over the levels of an axis"
+type Printed = pytest.CaptureFixture[str]
 type Rows = list[dict[str, Any]]
 
 
@@ -302,6 +303,29 @@ def test_the_page_says_how_many_lines_are_damaged(rows: Rows, tmp_path: Path) ->
     path.write_text("".join(json.dumps(row) + "\n" for row in rows) + "rubbish\n{}\n")
     assert main(["report", str(path), f"--output={tmp_path / 'page.html'}"]) == 0
     assert f"{path}: 2 damaged records are not counted" in (tmp_path / "page.html").read_text()
+
+
+@pytest.mark.parametrize("command", ["report", "export"])
+def test_unknown_policies_of_two_files_are_refused(command: str, tmp_path: Path, capsys: Printed) -> None:
+    x, y = (tmp_path / "x.jsonl", tmp_path / "y.jsonl")
+    for path, failure in ((x, None), (y, "dropped")):
+        path.write_text(json.dumps(values(0, failure, policy=None)) + "\n")
+    output = f"--output={tmp_path / 'out'}"
+    assert main([command, str(x), str(y), output]) == 1
+    assert f"the records of {x} and {y} name no policy" in capsys.readouterr().err
+    assert main([command, str(x), output]) == 0
+    assert main(["compare", str(x), str(y)]) == 0
+    assert "the same policy" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["report", "export"])
+def test_replaced_records_are_counted(command: str, rows: Rows, tmp_path: Path, capsys: Printed) -> None:
+    path = tmp_path / "r.jsonl"
+    path.write_text((json.dumps(rows[0]) + "\n") * 3)
+    assert main([command, str(path), f"--output={tmp_path / 'out'}"]) == 0
+    told = "act, place: 2 records are replaced by later ones of the same episode"
+    assert told in capsys.readouterr().err
+    assert command == "export" or told in (tmp_path / "out.html").read_text()
 
 
 def test_the_command_that_is_given_runs_the_same_again(rows: Rows, written: Path) -> None:

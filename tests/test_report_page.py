@@ -2,12 +2,12 @@
 
 import re
 
-from lerobot_bomb.report.chart import INK, Chart, chart_text
+from lerobot_bomb.report.chart import INK, Chart, chart_text, chart_texts
 from lerobot_bomb.report.dots import Block, Dot, DotColumn, dot_chart
 from lerobot_bomb.report.explanation import verdict_section
 from lerobot_bomb.report.page import MAX_ROWS, MAX_UNBROKEN, render
 from lerobot_bomb.report.table import Cell, Section, Statement, Table
-from lerobot_bomb.tables import MAX_NAME, shorten
+from lerobot_bomb.tables import MAX_NAME, shorten, shorten_all
 
 HOSTILE = "</svg><script>$x$ \n&amp;" + "n" * 5000
 
@@ -61,6 +61,14 @@ def test_names_are_shortened_in_their_middle() -> None:
     assert shorten("begin" + "x" * 100 + "end", 10) == "begin…xend"
     assert len(shorten("x" * 5000)) == MAX_NAME
     assert chart_text("a$b\nc") == r"a\$b\nc"
+
+
+def test_names_that_differ_in_the_middle_stay_apart() -> None:
+    names = [f"act pusht_act_lr{rate}_wd4_batch64_steps100k_final" for rate in ("0.1", "0.01", "0.011")]
+    short = shorten_all([*names, "act", names[0]])
+    assert len({*short.values()}) == 4 and max(map(len, short.values())) <= MAX_NAME
+    assert short["act"] == "act" and short[names[0]] == "act pusht_ac…1_wd4_batch…s100k_final"
+    assert chart_texts(names) == [short[name] for name in names]
 
 
 def test_hostile_text_is_text_on_the_page_and_in_a_chart() -> None:

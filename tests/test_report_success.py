@@ -1,12 +1,13 @@
 """Success in a report: sentences, ranking, the numbers of its figure, and levels of an axis."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from report_cases import Rows, columns, perturbed, write
-from result_rows import FDVLA, values
+from result_rows import ACT, FDVLA, values
 
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.commands.main import main
@@ -52,6 +53,21 @@ def test_a_policy_is_told_in_one_sentence_that_is_true_for_its_number_of_episode
         "less, p = 0.0015). No other axis shows a difference; about 101 seeds would show the largest, "
         "light:3 (10 points less)."
     ]
+
+
+def test_a_loss_below_a_point_is_no_zero(report: Callable[..., dict[str, Any]]) -> None:
+    section = report(perturbed({"none": outcomes(200, 200), "light:3": outcomes(199, 200)}))["Success"]
+    assert "(no difference shown: 0.5 points less, p = 1)" in section["statements"][0]
+
+
+def test_long_names_are_told_apart(report: Callable[..., dict[str, Any]]) -> None:
+    both = [
+        replace(ACT, path=f"pusht_act_lr{rate}_wd4_batch64_steps100k_final", weights_sha256=letter * 64)
+        for rate, letter in (("0.1", "a"), ("0.01", "b"))
+    ]
+    told = report(*(perturbed({"none": [None]}, each) for each in both))["Success"]["statements"][1]
+    first, _, second = told.partition(":")[0].partition(" against ")
+    assert first != second and "…" in first and "…" in second
 
 
 def test_one_episode_is_one_episode(report: Callable[..., dict[str, Any]]) -> None:

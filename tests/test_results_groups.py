@@ -89,6 +89,10 @@ LAST = "checkpoints/last/pretrained_model"
             [checkpoint("act", "x"), checkpoint("act", "x", interventions=("ReplaceTasks",))],
             ["act", "act with ReplaceTasks"],
         ),
+        (
+            [PolicyIdentity("act", is_in_training=True, training_step=step) for step in (None, 20, 40)],
+            ["act", "act step 20", "act step 40"],
+        ),
         ([None, PolicyIdentity("a"), PolicyIdentity("a")], ["policy not recorded", "a (1)", "a (2)"]),
     ],
 )
@@ -141,6 +145,13 @@ def test_what_does_not_compare_is_neither_pooled_nor_paired_and_named(
     assert "pairs," not in output
     if "spec" not in OTHER[name]:  # then the episodes are the same
         assert f"those of this file differ in {name}" in output
+
+
+def test_steps_of_a_training_are_not_pooled(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    early, late = (PolicyIdentity("act", is_in_training=True, training_step=step) for step in (20, 40))
+    text = of_evaluation(range(20), 20, failure="dropped", policy=early)
+    output = printed(path, text + of_evaluation(range(7), 20, policy=late), capsys)
+    assert "0/20" in output and "7/7" in output and "policy act (in training, step 40)" in output
 
 
 def test_two_policies_are_two_groups_with_pairs_of_their_own(

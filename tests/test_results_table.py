@@ -14,8 +14,9 @@ from lerobot_bomb.results.origin import PolicyIdentity
 type Printed = pytest.CaptureFixture[str]
 
 LEGEND = [
-    "success: with 95 % Wilson interval, clustered by seed; change: points, with 95 % interval, from the",
-    "same episodes unperturbed; p: exact McNemar test, to be trusted where interval and p disagree",
+    "success: with 95 % Wilson interval; change: points, with 95 % interval, from the same episodes",
+    "unperturbed; both clustered by seed; p: exact McNemar test of independent pairs; where interval and p",
+    "disagree, trust p, but the interval where pairs share seeds",
 ]
 
 
@@ -125,7 +126,7 @@ def test_what_is_missing_or_damaged_stands_below_the_table(path: Path, capsys: P
     path.write_text(row(0) + rows({"all:3": "+d"}) + '{"spec": {"se\n')
     assert main(["results", str(path)]) == 0
     printed = capsys.readouterr()
-    below = printed.out.splitlines()[6:8]
+    below = printed.out.splitlines()[7:9]
     assert below == [
         "r.jsonl: damaged records, which are not counted: 1",
         "r.jsonl: act, place: perturbed episodes without an unperturbed one to compare with: 1; add "

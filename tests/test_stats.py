@@ -10,6 +10,7 @@ from statsmodels.stats.proportion import proportion_confint
 from lerobot_bomb.stats import (
     PairedCounts,
     Rate,
+    clustered_difference_interval,
     clustered_interval,
     episodes_to_tell_apart,
     format_p,
@@ -166,6 +167,29 @@ def test_the_interval_of_a_paired_difference_holds_the_truth_in_95_of_100(
     intervals = [paired_difference_interval(table) for table in tables]
     # a little wider than need be where few pairs have one of the outcomes
     assert 0.94 < np.mean([low <= truth <= high for low, high in intervals]) < 0.97
+
+
+@pytest.mark.parametrize("num_seeds", [5, 20])
+def test_clustered_pairs_hold_the_truth_in_95(num_seeds: int) -> None:
+    rng = np.random.default_rng(0)
+    seeds = np.repeat(np.arange(num_seeds), 11).tolist()
+    covered = []
+    for _ in range(1000):
+        first, second = (rng.beta(0.5, 0.5, num_seeds) for _ in range(2))  # policies find other seeds hard
+        first_N, second_N = (rng.random((num_seeds, 11)) < rate[:, None] for rate in (first, second))
+        counts = PairedCounts.of(first_N.ravel().tolist(), second_N.ravel().tolist())
+        differences = second_N.ravel().astype(int) - first_N.ravel()
+        low, high = clustered_difference_interval(counts, differences.tolist(), seeds) or (0, 0)
+        covered.append(low <= 0 <= high)
+    assert 0.94 < np.mean(covered) < 0.99
+
+
+def test_a_pair_for_each_cluster_is_independent() -> None:
+    counts = PairedCounts(5, 2, 7, 1)
+    differences = [0] * 6 + [-1] * 2 + [1] * 7
+    expected = paired_difference_interval(counts)
+    assert clustered_difference_interval(counts, differences, range(15)) == expected
+    assert clustered_difference_interval(counts, differences, [0] * 15) is None
 
 
 @pytest.mark.parametrize(("n", "rate"), [(40, 0.5), (100, 0.9), (300, 0.97)])

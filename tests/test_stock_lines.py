@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from pusht_checkpoints import write_act
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.evaluation.eval_info import results_of
 from lerobot_bomb.libero.assets import Libero
+from lerobot_bomb.results.comparison import compare
 from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_bomb.results.reading import parse_record
@@ -165,6 +167,16 @@ def test_libero_is_told_apart_by_the_number_that_chooses_the_initial_state() -> 
     flags = StockLiberoResult.eval_flags(rows)
     assert flags[0] == "--env.type=libero" and flags[-1] == "--eval.use_async_envs=false"
     assert "--env.task=libero_goal" in flags and "--env.task_ids=[3]" in flags
+
+
+def test_a_flag_without_value_differs_from_both_sides() -> None:
+    a, b = (
+        [*results_of(info("libero_goal", 3, [1.0]), LiberoEnv(episode_length=length), policy, 7, 1)]
+        for length, policy in ((None, ACT), (100, replace(ACT, type="other")))
+    )
+    for sides in ((a, b), (b, a)):
+        with pytest.raises(ValueError, match="no episode is in both: they differ in episode_length"):
+            compare(*sides)
 
 
 def test_an_env_type_of_which_nothing_is_known_has_success_and_rewards(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.queries import last_query
-from lerobot_bomb.compat.hooks.evaluation import tell_of_evaluations
+from lerobot_bomb.compat.hooks.evaluation import note_training_steps, tell_of_evaluations
 from lerobot_bomb.compat.use import use
 from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
 from lerobot_bomb.flag_errors import flag_errors
@@ -54,6 +54,7 @@ class EvaluatedEnv(_EnvConfig):
 
     def __post_init__(self) -> None:
         use()
+        note_training_steps()
         with flag_errors():
             check_parallel_tasks(self.max_parallel_tasks)
             self._check()

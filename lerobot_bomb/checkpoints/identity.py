@@ -15,6 +15,7 @@ from lerobot_bomb.checkpoints.acting import acting_policy
 from lerobot_bomb.checkpoints.checks import ADAPTERS, PROCESSORS
 from lerobot_bomb.checkpoints.names import BLANK_IMAGES, REPLACE_TASKS, WEIGHTS, local_file
 from lerobot_bomb.checkpoints.queries import time_queries
+from lerobot_bomb.compat.hooks.evaluation import evaluated_step
 from lerobot_bomb.compat.hooks.policies import training_data
 from lerobot_bomb.files import read_json
 from lerobot_bomb.results.origin import PolicyIdentity
@@ -28,9 +29,9 @@ NOT_ITS_SETTINGS = {
 
 
 def identity_of(policy: PreTrainedPolicy) -> PolicyIdentity:
-    """Return the identity of a policy; while it is being trained, only its type."""
+    """Return the identity of a policy; while it is being trained, only its type and the step."""
     if training_data(policy.config) is not None:
-        return PolicyIdentity(policy.config.type, is_in_training=True)
+        return PolicyIdentity(policy.config.type, is_in_training=True, training_step=evaluated_step())
     return identity_of_config(policy.config)
 
 

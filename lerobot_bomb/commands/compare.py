@@ -102,12 +102,12 @@ def run(args: argparse.Namespace) -> int:
     print_lines(*comparisons.lines())
     if args.output is not None:
         _write(args, comparison_table(comparisons))
-    low = 100 * comparisons.lowest
+    low, how = comparisons.lowest
     verdicts = []
     if (bar := args.min_difference) is not None:
         verdicts.append((f"--min_difference={bar:g}: B is better by {bar:g} points or more", low >= bar))
     if (bar := args.non_inferior) is not None:
         verdicts.append((f"--non_inferior={bar:g}: B is worse by less than {bar:g} points", low > -bar))
     for claim, is_shown in verdicts:
-        print(f"{claim}: {'shown' if is_shown else 'not shown'} (lowest end of an interval {low:+.1f})")
+        print(f"{claim}: {'shown' if is_shown else 'not shown'} ({how})")
     return 0 if all(is_shown for _, is_shown in verdicts) else ANSWER_IS_NO

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from lerobot_bomb.commands.arguments import add_names_flag, path_flag, switch
-from lerobot_bomb.commands.results_files import check_outputs, names_of, read_undamaged
+from lerobot_bomb.commands.results_files import check_outputs, names_of, read_together, tell_replaced
 from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.files import file_names, written_whole
 from lerobot_bomb.report.eval_info import eval_info_files
@@ -51,8 +51,9 @@ def run(args: argparse.Namespace) -> int:
         model_index_yaml,
     )
 
-    records = [record for path in dict.fromkeys(args.paths) for record in read_undamaged(path).records]
+    records = [record for file in read_together(args.paths) for record in file.records]
     groups = groups_of(records, names_of(args.names, records))
+    tell_replaced(groups)
     contents = {args.output / LATEX: latex_tables(groups)}
     policies = policies_of(groups)
     _, _, *names = file_names([LATEX, BENCHMARK, *(each.short_name for each in policies)])

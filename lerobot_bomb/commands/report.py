@@ -10,7 +10,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from lerobot_bomb.commands.arguments import add_names_flag, check_at_least, path_flag
-from lerobot_bomb.commands.results_files import check_outputs, names_of, read_undamaged
+from lerobot_bomb.commands.results_files import check_outputs, names_of, read_together, tell_replaced
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.report.page import render
 from lerobot_bomb.report.report import Report, Sample, sample_failures
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"--output={output} must be the page's path, .html, or a folder")
     page, tables, rates = (output.with_suffix(suffix) for suffix in (".html", ".json", ".csv"))
     check_outputs(args.paths, (page, tables, rates))
-    files = [read_undamaged(path) for path in dict.fromkeys(args.paths)]
+    files = read_together(args.paths)
     records = [record for file in files for record in file.records]
     groups = groups_of(records, names_of(args.names, records))
     numbered = {file.path: file.numbered for file in files}
@@ -58,6 +58,7 @@ def run(args: argparse.Namespace) -> int:
         for file in files
         if file.num_damaged
     ]
+    missing += tell_replaced(groups)
     report = Report(groups, samples, missing)
     sections = build(report)
     with written_whole(page, tables, rates) as (html, as_json, as_csv):

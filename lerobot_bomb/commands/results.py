@@ -23,11 +23,12 @@ from lerobot_bomb.results.groups import (
 )
 from lerobot_bomb.results.summary import describe_unpaired, pair_lines, summarise
 from lerobot_bomb.stats import format_p
-from lerobot_bomb.tables import print_lines, print_table, shorten
+from lerobot_bomb.tables import print_lines, print_table, shorten_all
 
 LEGEND = (
-    "success: with 95 % Wilson interval, clustered by seed; change: points, with 95 % interval, from the",
-    "same episodes unperturbed; p: exact McNemar test, to be trusted where interval and p disagree",
+    "success: with 95 % Wilson interval; change: points, with 95 % interval, from the same episodes",
+    "unperturbed; both clustered by seed; p: exact McNemar test of independent pairs; where interval and p",
+    "disagree, trust p, but the interval where pairs share seeds",
 )
 WORDS = ("policy", "suite", "condition")  # columns at the left
 
@@ -84,10 +85,11 @@ def _print_rates(told: list[FileGroups], by_file: list[list[Series]]) -> None:
     """Print a line for each group and condition."""
     several = len(told) > 1
     apart = [*{name: None for each in told for name in differing_otherwise(each.groups)}]
+    names = shorten_all(group.policy for each in told for group in each.groups)
     rows = [
         [
             *([str(each.file.path)] if several else []),
-            *(shorten(series.policy), suite_of(series.group)),
+            *(names[series.policy], suite_of(series.group)),
             *(_setting(series.group, name) for name in apart),
             *cells,
         ]
@@ -120,6 +122,7 @@ def _setting(group: Group, name: str) -> str:
 
 def _notes(told: list[FileGroups]) -> Iterator[str]:
     """Yield what is damaged, not compared, or kept apart."""
+    names = shorten_all(group.name for each in told for group in each.groups)
     for each in told:
         path = each.file.path
         if each.file.num_damaged:
@@ -128,7 +131,7 @@ def _notes(told: list[FileGroups]) -> Iterator[str]:
             yield f"{path}: episodes that differ in {', '.join(apart)} are neither pooled nor paired"
         for group in each.groups:
             if unpaired := describe_unpaired(group, each.groups):
-                yield f"{path}: {shorten(group.name)}: {unpaired}"
+                yield f"{path}: {names[group.name]}: {unpaired}"
 
 
 def _print_details(told: FileGroups, series: list[Series]) -> None:
@@ -145,8 +148,8 @@ def _print_details(told: FileGroups, series: list[Series]) -> None:
             version = group.records[0].protocol_version
             lacking = ", ".join(group.missing_fields)
             print(f"{path}: records of protocol {version} lack {lacking}")
-        if group.num_replaced:
-            print(f"{path}: {group.num_replaced} records are replaced by later ones of the same episode")
+        if group.replaced:
+            print(f"{path}: {group.replaced}")
         conditions = by_condition(group.records)
         for condition, records in conditions.items():
             label = f" (perturbations={condition})" if len(conditions) > 1 else ""

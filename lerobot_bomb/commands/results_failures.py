@@ -8,7 +8,7 @@ from lerobot_bomb.environments import env_type
 from lerobot_bomb.report.report import Sample
 from lerobot_bomb.results.bomb import put_down
 from lerobot_bomb.results.groups import Group, by_condition, suite_of
-from lerobot_bomb.tables import print_table, shorten
+from lerobot_bomb.tables import print_table, shorten_all
 
 
 def print_failures(files: Sequence[FileGroups]) -> None:
@@ -21,7 +21,8 @@ def print_failures(files: Sequence[FileGroups]) -> None:
         number = sum(len(group.records) for group in groups)
         print(f"no failure in {number} episode{'s' * (number != 1)}")
         return
-    rows = [_row(*failure) for failure in failures]
+    names = shorten_all(group.policy for group in groups)
+    rows = [_row(names[group.policy], group, sample) for group, sample in failures]
     is_same = {
         "policy": len({group.policy for group in groups}) == 1,
         "suite": len({suite_of(group) for group in groups}) == 1,
@@ -34,13 +35,13 @@ def print_failures(files: Sequence[FileGroups]) -> None:
         print_next({explanation: "what the actions of the first depend on"})
 
 
-def _row(group: Group, failure: Sample) -> dict[str, str]:
+def _row(policy: str, group: Group, failure: Sample) -> dict[str, str]:
     """Return {column: text} of a failed episode."""
     record = failure.record
     return {
         "line": str(failure.line),
         "seed": str(record.spec.seed),
-        "policy": shorten(group.policy),
+        "policy": policy,
         "suite": suite_of(group),
         "condition": record.spec.perturbations,
         "failure": str(record.failure),

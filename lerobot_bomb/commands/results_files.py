@@ -15,6 +15,7 @@ from lerobot_bomb.results.reading import check_any, read_records
 from lerobot_bomb.results.record import Record, Spec, describe_numbers
 from lerobot_bomb.sweep.manifest import NAME, Manifest
 from lerobot_bomb.sweep.store import ERRORS, RESULTS, num_lost, read_errors
+from lerobot_bomb.tables import in_a_row
 
 MAX_SHOWN_DAMAGES = 10
 
@@ -153,6 +154,31 @@ def read_undamaged(path: Path) -> ResultsFile:
     if missing:
         print(missing, file=sys.stderr)
     return ResultsFile(path, numbered, len(damages), missing)
+
+
+def read_together(paths: Iterable[Path]) -> list[ResultsFile]:
+    """Read files whose records are pooled, each once, as `read_undamaged`.
+
+    Raises:
+        ValueError: the policies of several files are not recorded, so nothing tells them apart; or see
+            `read_undamaged`.
+    """
+    files = [read_undamaged(path) for path in dict.fromkeys(paths)]
+    unknown = [str(file.path) for file in files if any(each.policy is None for each in file.records)]
+    if len(unknown) > 1:
+        raise ValueError(
+            f"the records of {in_a_row(unknown)} name no policy, so nothing tells if it is one: give one "
+            "of these files, or join those of one policy"
+        )
+    return files
+
+
+def tell_replaced(groups: Iterable[Group]) -> list[str]:
+    """Print to stderr how many records of each group are replaced by later ones; return these lines."""
+    lines = [f"{group.name}: {group.replaced}" for group in groups if group.replaced]
+    for line in lines:
+        print(line, file=sys.stderr)
+    return lines
 
 
 def policy_keys(flag: str, names: Sequence[str], records: Sequence[Record]) -> list[str]:

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.bootstrap import Estimate, paired_bootstrap_interval, sums_by
+from lerobot_bomb.bootstrap import Estimate, paired_bootstrap_interval
 from lerobot_bomb.evaluation.executed import ActionLog, start_of
 from lerobot_bomb.smoothness import MIN_ACTIONS, smoothness
+from lerobot_bomb.stats import sums_by
 from lerobot_bomb.tables import print_table
 
 GRIPPER = "gripper"  # in the names of dims that do not count

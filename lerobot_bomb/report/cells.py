@@ -7,9 +7,10 @@ from lerobot_bomb.report.table import Cell
 from lerobot_bomb.results.groups import rate_of
 from lerobot_bomb.results.pairs import PairedComparison
 from lerobot_bomb.results.record import Record
-from lerobot_bomb.stats import format_bounds, format_p
+from lerobot_bomb.stats import format_bounds, format_p, points_format
 
 INTERVALS = "95 % Wilson intervals, clustered by seed"  # of `rate`
+PAIRED_INTERVAL = "Newcombe's 95 % interval for pairs, clustered by seed"  # of `points`
 
 
 def rate[R: Record](
@@ -26,9 +27,10 @@ def rate[R: Record](
 
 def points(compared: PairedComparison) -> list[Cell]:
     """Return the cells '-12 [-20, -5]', second rate minus first in percentage points, and p-value."""
-    counts, (low, high) = compared.counts, compared.interval
+    counts, (low, high) = compared.counts, compared.interval or (None, None)
     value = {"difference": counts.difference, "low": low, "high": high, **vars(counts)}
-    text = f"{100 * counts.difference:+.0f}{format_bounds(compared.interval, '+.0f', 100)}"
+    form = f"+{points_format(counts.difference)}"
+    text = f"{100 * counts.difference:{form}}{format_bounds(compared.interval, form, 100)}"
     return [Cell(text, value), Cell(format_p(compared.p_value).removeprefix("p = "), compared.p_value)]
 
 

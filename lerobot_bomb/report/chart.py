@@ -2,13 +2,13 @@
 
 import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from typing import TYPE_CHECKING, Any
 
 from lerobot_bomb.report.table import Table
-from lerobot_bomb.tables import printable, shorten
+from lerobot_bomb.tables import printable, shorten_all
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -90,7 +90,14 @@ def standalone(svg: str) -> str:
 
 def chart_text(name: str) -> str:
     """Return a name for matplotlib, which takes `$` for mathematics; shortened."""
-    return shorten(printable(name)).replace("$", r"\$")
+    return chart_texts([name])[0]
+
+
+def chart_texts(names: Sequence[str]) -> list[str]:
+    """Return the names of a chart as `chart_text`; those that differ still do."""
+    shown = [*map(printable, names)]
+    short = shorten_all(shown)
+    return [short[name].replace("$", r"\$") for name in shown]
 
 
 def tidy(axes: "Axes", grid: str = "x") -> None:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from lerobot_bomb.report.chart import COLORS, INK, MARKERS, WIDTH, chart_text, draw, tidy
+from lerobot_bomb.report.chart import COLORS, INK, MARKERS, WIDTH, chart_text, chart_texts, draw, tidy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,7 +75,7 @@ def add_legend(figure: "Figure", series: Sequence[str]) -> None:
         Line2D([], [], color=COLORS[i % len(COLORS)], marker=MARKERS[i % len(MARKERS)], linestyle="-")
         for i in range(len(series))
     ]
-    figure.legend(handles, [*map(chart_text, series)], loc="outside upper left", ncols=3)
+    figure.legend(handles, chart_texts(series), loc="outside upper left", ncols=3)
 
 
 def _paint_column(axes: "Axes", block: Block, column: DotColumn, num_series: int, has_names: bool) -> None:
@@ -87,7 +87,7 @@ def _paint_column(axes: "Axes", block: Block, column: DotColumn, num_series: int
         for row, dot in enumerate(dots):
             if dot is not None:
                 _paint_dot(axes, dot, row + shift, number)
-    names = [*map(chart_text, block.rows)] if has_names else [""] * len(block.rows)
+    names = chart_texts(block.rows) if has_names else [""] * len(block.rows)
     axes.set_yticks(range(len(block.rows)), names)
     axes.set_ylim(len(block.rows) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 from lerobot_bomb.files import file_names
-from lerobot_bomb.report.cells import INTERVALS
+from lerobot_bomb.report.cells import INTERVALS, PAIRED_INTERVAL
 from lerobot_bomb.report.panels import Panel, Series, panels_of
 from lerobot_bomb.results.comparison import Comparisons, compare
 from lerobot_bomb.results.groups import (
@@ -21,7 +21,7 @@ from lerobot_bomb.results.groups import (
 from lerobot_bomb.results.pairs import PairedComparison, describe_test
 from lerobot_bomb.results.record import describe_numbers
 from lerobot_bomb.stats import SIGNIFICANT, Rate
-from lerobot_bomb.tables import printable, shorten
+from lerobot_bomb.tables import printable, shorten_all
 
 SPECIAL = {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
@@ -53,10 +53,11 @@ def comparison_table(comparisons: Comparisons) -> str:
     """Write a `table` of two policies on the same episodes; the better in bold."""
     conditions = comparisons.conditions
     groups = groups_of(record for each in conditions for pair in each.pairs for record in pair)
-    a, b = (_escaped(shorten(name)) for name in comparisons.names)
+    short = shorten_all(comparisons.names)
+    a, b = (_escaped(short[name]) for name in comparisons.names)
     caption = (
         f"{_where(groups, f' of {a} (A) and {b} (B)')}. B $-$ A: in points, on the same episodes, with "
-        rf"Newcombe's 95 \% interval for pairs; $p$: {_escaped(describe_test(len(conditions)))}. "
+        f"{_escaped(PAIRED_INTERVAL)}; $p$: {_escaped(describe_test(conditions))}. "
         f"Bold: better, $p < {SIGNIFICANT}$. {_simulated(groups)}"
     )
     header = [_line("condition", "A", "B", "B $-$ A", "$p$", "pairs")]
@@ -67,11 +68,11 @@ def _compared_line(compared: PairedComparison) -> str:
     difference = compared.counts.difference
     is_better = compared.is_shown and difference < 0, compared.is_shown and difference > 0
     rates = [rate_of(list(records)) for records in zip(*compared.pairs, strict=True)]
-    low, high = compared.interval
+    interval = "" if compared.interval is None else f" [{', '.join(map(_points, compared.interval))}]"
     return _line(
         _escaped(compared.condition),
         *map(_rate, rates, is_better),
-        f"{_points(difference)} [{_points(low)}, {_points(high)}]",
+        f"{_points(difference)}{interval}",
         _p(compared.p_value),
         str(compared.counts.n),
     )
@@ -133,17 +134,18 @@ def _written(panel: Panel, label: str, apart: list[str], wins: Wins) -> str:
     }
     write = _beside if len(panel.series) <= MAX_BESIDE else _below
     caption = _caption(panel, apart, is_bold=bool(best))
-    return _float(caption, label, *write(panel.series, conditions, columns, cells))
+    return _float(caption, label, *write(panel, conditions, columns, cells))
 
 
 type _Cells = dict[tuple[str, str], list[str]]  # of a group's name and a condition
 
 
 def _beside(
-    several: list[Series], conditions: list[str], columns: list[str], cells: _Cells
+    panel: Panel, conditions: list[str], columns: list[str], cells: _Cells
 ) -> tuple[str, list[str], list[str]]:
     """Return alignment, header and lines of a table with the policies beside each other."""
-    names, width = [*map(_name, several)], len(columns)
+    several, width = panel.series, len(columns)
+    names = [_name(each, panel) for each in several]
     header = [_line("condition", *names)] if width == 1 else _spanned(names, columns)
     lines = [
         _line(_escaped(condition), *(cell for each in several for cell in cells[each.group.name, condition]))
@@ -162,21 +164,21 @@ def _spanned(names: list[str], columns: list[str]) -> list[str]:
 
 
 def _below(
-    several: list[Series], conditions: list[str], columns: list[str], cells: _Cells
+    panel: Panel, conditions: list[str], columns: list[str], cells: _Cells
 ) -> tuple[str, list[str], list[str]]:
     """Return alignment, header and lines of a table with the policies below each other."""
     lines: list[str] = []
     for condition in conditions:
-        having = [each for each in several if condition in each.rates]
+        having = [each for each in panel.series if condition in each.rates]
         lines += [r"\addlinespace"] if lines else []
         for place, each in enumerate(having):
             first = "" if place else _escaped(condition)
-            lines.append(_line(first, _name(each), *cells[each.group.name, condition]))
+            lines.append(_line(first, _name(each, panel), *cells[each.group.name, condition]))
     return "ll" + "r" * len(columns), [_line("condition", "policy", *columns)], lines
 
 
-def _name(series: Series) -> str:
-    return _escaped(shorten(series.policy))
+def _name(series: Series, panel: Panel) -> str:
+    return _escaped(panel.short_names[series.policy])
 
 
 def _cells(series: Series, condition: str, best: set[tuple[str, str]], number: int) -> list[str]:
@@ -193,9 +195,8 @@ def _caption(panel: Panel, apart: list[str], is_bold: bool) -> str:
     changes = [change for each in panel.series for change in each.costs.values()]
     parts = [f"{_where(groups)}."]
     if changes:
-        numbers = {each.num_conditions for each in changes}
-        test = describe_test(numbers.pop()) if len(numbers) == 1 else "exact McNemar test, adjusted (Holm)"
-        parts.append(f"Change: in points, from the same episodes unperturbed; $p$: {_escaped(test)}.")
+        test = _escaped(describe_test(changes))
+        parts.append(f"Change: in points, from the same episodes unperturbed; $p$: {test}.")
     if len(groups) > 1:
         test = f"$p < {SIGNIFICANT}$, exact McNemar test on the same episodes, adjusted for conditions (Holm)"
         claim = "Bold: better" if is_bold else "Under no condition is a policy shown to be better"

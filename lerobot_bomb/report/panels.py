@@ -12,7 +12,7 @@ from lerobot_bomb.results.pairs import PairedComparison
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.results.summary import changes_of
 from lerobot_bomb.stats import Rate
-from lerobot_bomb.tables import shorten
+from lerobot_bomb.tables import shorten, shorten_all
 
 MAX_CONDITIONS = 24  # that a chart can show below each other
 MAX_SETTING = 24  # characters of a setting in the name of a panel
@@ -62,6 +62,11 @@ class Panel:
 
     name: str  # 'place'; '' if there is nothing to tell
     series: list[Series]
+
+    @cached_property
+    def short_names(self) -> dict[str, str]:
+        """Names of the policies as sentences and tables show them."""
+        return shorten_all(each.policy for each in self.series)
 
     @cached_property
     def conditions(self) -> list[AxisCondition]:

@@ -9,8 +9,8 @@ from lerobot_bomb.report.table import Statement
 from lerobot_bomb.results.comparison import Comparisons, describe_verdict
 from lerobot_bomb.results.groups import rate_of, settings_of
 from lerobot_bomb.results.pairs import PairedComparison
-from lerobot_bomb.stats import Rate, format_p
-from lerobot_bomb.tables import first_of, in_a_row, shorten
+from lerobot_bomb.stats import Rate, format_p, points_format
+from lerobot_bomb.tables import first_of, in_a_row
 
 MAX_NAMED = 3  # names in a sentence
 MAX_PLACES = 6  # of a ranking
@@ -68,10 +68,14 @@ def _change(compared: PairedComparison) -> str:
 
 
 def _points(compared: PairedComparison) -> str:
-    points = 100 * compared.counts.difference
-    if points == 0:
+    difference = compared.counts.difference
+    if difference == 0:
         return "no change"
-    return f"{abs(points):.0f} points {'less' if points < 0 else 'more'}"
+    return f"{_num_points(difference)} {'less' if difference < 0 else 'more'}"
+
+
+def _num_points(difference: float) -> str:
+    return f"{100 * abs(difference):{points_format(difference)}} points"
 
 
 def _costs(series: Series) -> Iterator[str]:
@@ -137,7 +141,7 @@ def _no_difference(others: Sequence[PairedComparison], kind: str) -> str:
 
 
 def _unit(compared: PairedComparison) -> str:
-    return "seeds" if compared.num_starts == len(compared.pairs) else "pairs of episodes"
+    return "pairs of episodes" if compared.is_clustered else "seeds"
 
 
 def describe_ranking(panel: Panel) -> Iterator[Statement]:
@@ -150,7 +154,7 @@ def describe_ranking(panel: Panel) -> Iterator[Statement]:
     rates = {each.policy: rate_of(shared) for each, shared in zip(panel.series, records, strict=True)}
     tied: dict[float, list[str]] = {}
     for each in panel.ranked:
-        tied.setdefault(rates[each.policy].share, []).append(shorten(each.policy))
+        tied.setdefault(rates[each.policy].share, []).append(panel.short_names[each.policy])
     places = [
         f"{in_a_row(first_of(names, MAX_NAMED))} {'tie at ' if len(names) > 1 else ''}{100 * share:.0f} %"
         for share, names in tied.items()
@@ -166,16 +170,17 @@ def _why_not_ranked(panel: Panel) -> str:
     specs = {each.policy: {record.spec for record in each.group.records} for each in panel.series}
     for first, second in combinations(specs, 2):
         if specs[first].isdisjoint(specs[second]):
-            return f"{shorten(first)} and {shorten(second)} have no episode in common"
+            return f"{panel.short_names[first]} and {panel.short_names[second]} have no episode in common"
     return "no episode was run by all policies, though each two of them have some in common"
 
 
-def describe_comparison(first: Series, second: Series, compared: Comparisons) -> Statement:
+def describe_comparison(panel: Panel, first: Series, second: Series, compared: Comparisons) -> Statement:
     """Say which of two policies of a panel is better, and under which conditions."""
-    found = [each for each in compared.conditions if _is_of(each, first)]
+    settings = first.group.settings, second.group.settings
+    found = [each for each in compared.conditions if tuple(map(settings_of, each.pairs[0])) == settings]
     nominal = [each for each in found if each.pairs[0][0].spec.perturbations == NONE]
     others = [each for each in found if each.pairs[0][0].spec.perturbations != NONE]
-    names = shorten(first.policy), shorten(second.policy)
+    names = panel.short_names[first.policy], panel.short_names[second.policy]
     parts = [f"unperturbed, {describe_verdict(each, *names)}." for each in nominal]
     if len(others) == 1:
         under = f"{'U' if parts else 'u'}nder {others[0].pairs[0][0].spec.perturbations}"
@@ -183,10 +188,6 @@ def describe_comparison(first: Series, second: Series, compared: Comparisons) ->
     elif others:
         parts.append(_perturbed_verdict(others, *names))
     return Statement(f"{names[0]} against {names[1]}:", " ".join(parts) or "no episode of both.")
-
-
-def _is_of(compared: PairedComparison, series: Series) -> bool:
-    return settings_of(compared.pairs[0][0]) == series.group.settings
 
 
 def _perturbed_verdict(found: Sequence[PairedComparison], first: str, second: str) -> str:
@@ -198,8 +199,8 @@ def _perturbed_verdict(found: Sequence[PairedComparison], first: str, second: st
         if better:
             most = max(better, key=lambda each: sign * each.counts.difference)
             condition = most.pairs[0][0].spec.perturbations
-            points = 100 * abs(most.counts.difference)
+            points = _num_points(most.counts.difference)
             is_better = f"{name} is significantly better under {len(better)}"
-            parts.append(f"{is_better}, most under {condition} (by {points:.0f} points)")
+            parts.append(f"{is_better}, most under {condition} (by {points})")
     told = in_a_row(parts) if parts else "none shows a significant difference"
     return f"Of {len(found):,} perturbed conditions, {told}."

@@ -1,7 +1,7 @@
 """Title of a report: what was evaluated."""
 
 from lerobot_bomb.report.report import Report
-from lerobot_bomb.tables import in_a_row, shorten
+from lerobot_bomb.tables import in_a_row, shorten_all
 
 MAX_NAMED = 3  # policies and suites that a title names
 
@@ -10,7 +10,7 @@ def title_of(report: Report) -> str:
     """Return 'act and pi0 on bomb (place): 400 episodes, 11 conditions'."""
     policies = list(report.policies)
     few = len(policies) <= MAX_NAMED
-    who = in_a_row([*map(shorten, policies)]) if few else f"{len(policies)} policies"
+    who = in_a_row([*shorten_all(policies).values()]) if few else f"{len(policies)} policies"
     suites: dict[str, dict[str, None]] = {}
     for group in report.groups:
         of_type = suites.setdefault(group.record_type.env_type, {})

@@ -23,7 +23,7 @@ from lerobot_bomb.bomb.observation import (
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suite import FIRST_VERSION, find_suite
 from lerobot_bomb.bomb.suites import OWN_SUITES, SUITES
-from lerobot_bomb.bootstrap import bca_interval, sums_by
+from lerobot_bomb.bootstrap import bca_interval
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.results import schema
@@ -31,7 +31,7 @@ from lerobot_bomb.results.measures import Measure
 from lerobot_bomb.results.origin import NOT_RECORDED, installed_version, json_list, uses_sapien
 from lerobot_bomb.results.record import Record, describe_numbers
 from lerobot_bomb.results.schema import Count, Quantity
-from lerobot_bomb.stats import format_bounds
+from lerobot_bomb.stats import format_bounds, sums_by
 
 OLD_VERSION = "1.0"  # whose records say less
 # outcomes of an episode in which the stone was carried and put down somewhere on the board

@@ -1,17 +1,29 @@
 """Comparison of two policies on the same episodes: which is better, by how much, and is it certain?"""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import Any
 
-from lerobot_bomb.results.groups import POLICY, Group, groups_of, rate_of
+from lerobot_bomb.results.groups import POLICY, Group, by_condition, differing, groups_of, rate_of
 from lerobot_bomb.results.names import policy_names
 from lerobot_bomb.results.origin import NOT_RECORDED
-from lerobot_bomb.results.pairs import Pair, PairedComparison, compare_pairs, describe_test, episode_key
+from lerobot_bomb.results.pairs import (
+    Pair,
+    PairedComparison,
+    are_clustered,
+    compare_pairs,
+    describe_test,
+    episode_key,
+)
 from lerobot_bomb.results.record import Record
-from lerobot_bomb.stats import format_p
+from lerobot_bomb.stats import format_bounds, format_p, points_format
+from lerobot_bomb.tables import in_a_row
+
+ABSENT = "none"  # value of a setting that a record lacks: SAPIEN of MuJoCo's, a flag that is null
 
 type Values = dict[str, set[str]]  # of settings
+type Settings = dict[str, str]  # {name: the value in a pair, or both values}
 
 
 @dataclass(frozen=True)
@@ -22,11 +34,27 @@ class Comparisons:
     names: tuple[str, str]  # the shortest that tell them apart
     conditions: list[PairedComparison]
     num_unpaired: tuple[int, int]  # episodes that the other policy did not run
+    unpaired: tuple[list[str], list[str]]  # conditions none of whose episodes the other policy ran
 
     @property
-    def lowest(self) -> float:
-        """Lowest end of all intervals: the second policy is better by at least that under every condition."""
-        return min(each.interval[0] for each in self.conditions)
+    def lowest(self) -> tuple[float, str]:
+        """Points by which B is better at least, under every condition, and how they are known.
+
+        -inf if they are not: a condition has no pairs, or all its pairs are of one start.
+        """
+        if lacking := self.without_pairs:
+            return -inf, lacking
+        if of_one_seed := [each.condition for each in self.conditions if each.interval is None]:
+            return -inf, f"all pairs are of one seed under {in_a_row(of_one_seed)}"
+        low = 100 * min(each.interval[0] for each in self.conditions if each.interval is not None)
+        return low, f"lowest end of an interval {low:+.1f}"
+
+    @property
+    def without_pairs(self) -> str:
+        """Text 'no pairs under camera:3 of A'; '' if each condition of both has some."""
+        lacking = zip("AB", self.unpaired, strict=True)
+        told = [f"{in_a_row(conditions)} of {side}" for side, conditions in lacking if conditions]
+        return f"no pairs under {in_a_row(told)}" if told else ""
 
     def verdicts(self) -> list[str]:
         """Say under which conditions which policy is better."""
@@ -46,41 +74,46 @@ class Comparisons:
         a, b = self.names
         lines = [f"A is {a}, B is {b}", *self.verdicts(), ""]
         lines += [f"{name}: {policy}" for name, policy in zip("AB", self.policies, strict=True)]
-        lines += ["A and B are the same policy"] if self.policies[0] == self.policies[1] else []
+        is_same = self.policies[0] == self.policies[1] != NOT_RECORDED
+        lines += ["A and B are the same policy"] if is_same else []
         for each in self.conditions:
             lines += [f"{each.condition}: {_num_pairs(each)}", *(f"  {line}" for line in _lines(each))]
         if any(self.num_unpaired):
             a, b = self.num_unpaired
-            lines.append(f"not compared, since only one has them: {a} episodes of A, {b} of B")
+            told = f"not compared, since only one has them: {a} episodes of A, {b} of B"
+            lines.append("; ".join(filter(None, [told, self.without_pairs])))
         notes = (
-            "rates: 95 % Wilson intervals, clustered by seed; B - A: Newcombe's for pairs; p: "
-            f"{describe_test(len(self.conditions))}, to be trusted where the two disagree, as with few pairs"
+            "rates: 95 % Wilson intervals, clustered by seed; B - A: Newcombe's for pairs, likewise; p: "
+            f"{describe_test(self.conditions)}"
         )
+        if not are_clustered(self.conditions):
+            notes += ", to be trusted where the two disagree, as with few pairs"
         return [*lines, notes]
 
 
 def describe_verdict(compared: PairedComparison, first: str = "A", second: str = "B") -> str:
     """Return 'B is better by 28 points [12, 43] (40 pairs, p = 0.0068)', or that this is not significant."""
     counts = compared.counts
-    pairs = f"{counts.n} pair{'s' * (counts.n != 1)}"
+    pairs = _num_pairs(compared)
     if counts.difference == 0:
         return f"they tie ({counts.first} success{'es' * (counts.first != 1)} each in {pairs})"
-    low, high = compared.interval
-    better, low, high = (first, -high, -low) if counts.difference < 0 else (second, low, high)
-    points = f"{100 * abs(counts.difference):.0f} points [{100 * low:.0f}, {100 * high:.0f}]"
+    better, interval = second, compared.interval
+    if counts.difference < 0:
+        better, interval = first, interval and (-interval[1], -interval[0])
+    form = points_format(counts.difference)
+    points = f"{100 * abs(counts.difference):{form}} points{format_bounds(interval, form, 100)}"
     test = f"{pairs}, {format_p(compared.p_value)}"
     if compared.is_shown:
         return f"{better} is better by {points} ({test})"
     needed = f"; about {compared.num_needed:,} pairs would settle it" if compared.num_needed else ""
-    return f"not significant: {better} leads by {points} ({test}{needed})"
+    why = "not shown" if compared.is_significant else "not significant"
+    return f"{why}: {better} leads by {points} ({test}{needed})"
 
 
 def _num_pairs(compared: PairedComparison) -> str:
-    if compared.num_starts == len(compared.pairs):
-        return f"{len(compared.pairs)} pairs"
-    return (
-        f"{len(compared.pairs)} pairs of {compared.num_starts} seeds, which B - A and p take as independent"
-    )
+    of_seeds = f" of {compared.num_starts} seed{'s' * (compared.num_starts != 1)}"
+    number = len(compared.pairs)
+    return f"{number} pair{'s' * (number != 1)}{of_seeds * compared.is_clustered}"
 
 
 def _lines(compared: PairedComparison) -> list[str]:
@@ -136,11 +169,13 @@ def compare(
     if not pairs:
         raise ValueError(f"no episode is in both: {_why_none(*groups, across)}")
     num_first, num_second = (sum(len(group.records) for group in policy_groups) for policy_groups in groups)
+    first_paired, second_paired = ({id(pair[side]) for _, pair in pairs} for side in (0, 1))
     return Comparisons(
         policies=policies,
         names=_names(groups[0][0], groups[1][0], names, across),
         conditions=compare_pairs(_by_condition(pairs)),
         num_unpaired=(num_first - len(pairs), num_second - len(pairs)),
+        unpaired=(_unpaired(groups[0], first_paired), _unpaired(groups[1], second_paired)),
     )
 
 
@@ -156,21 +191,35 @@ def _names(
     return f"{name}, {across} {first.settings[across]}", f"{name}, {across} {second.settings[across]}"
 
 
-def _by_condition(pairs: list[tuple[Group, Pair]]) -> dict[str, list[Pair]]:
+def _by_condition(pairs: list[tuple[Settings, Pair]]) -> dict[str, list[Pair]]:
     """Split pairs by condition, and by every setting with several values, such as the suite."""
-    settings = [dict(items) for items in dict.fromkeys(tuple(group.settings.items()) for group, _ in pairs)]
+    settings = [dict(items) for items in dict.fromkeys(tuple(each.items()) for each, _ in pairs)]
     names = dict.fromkeys(name for values in settings for name in values if name != POLICY)
     several = [name for name in names if len({values.get(name) for values in settings}) > 1]
     labelled: dict[str, list[Pair]] = {}
-    for group, pair in pairs:
-        shown = (_shown(name, group.settings.get(name)) for name in several)
-        labelled.setdefault(", ".join([*shown, pair[0].spec.perturbations]), []).append(pair)
+    for values, pair in pairs:
+        label = _condition_label(several, values, pair[0].spec.perturbations)
+        labelled.setdefault(label, []).append(pair)
     return labelled
 
 
-def _shown(name: str, value: str | None) -> str:
-    """Return 'place' for a suite, 'fps 20' for another setting."""
-    return f"{value}" if name == "suite" else f"{name} {value}"
+def _condition_label(names: Iterable[str], values: Settings, perturbations: str) -> str:
+    """Return 'place, fps 20, camera:3': these settings and the perturbations."""
+    shown = ((name, values.get(name, ABSENT)) for name in names)
+    return ", ".join(
+        [*(value if name == "suite" else f"{name} {value}" for name, value in shown), perturbations]
+    )
+
+
+def _unpaired(groups: list[Group], paired: set[int]) -> list[str]:
+    """Return the conditions of groups of which no record, by its id, has a pair."""
+    several = differing(groups)
+    return [
+        _condition_label(several, group.settings, condition)
+        for group in groups
+        for condition, records in by_condition(group.records).items()
+        if paired.isdisjoint(map(id, records))
+    ]
 
 
 def _only_policy(name: str, groups: list[Group]) -> str:
@@ -184,20 +233,34 @@ def _only_policy(name: str, groups: list[Group]) -> str:
     return groups[0].records[0].describe_policy()
 
 
-def _pairs(first: list[Group], second: list[Group], across: str | None) -> Iterator[tuple[Group, Pair]]:
-    """Yield each pair with the group of its first record."""
+def _pairs(first: list[Group], second: list[Group], across: str | None) -> Iterator[tuple[Settings, Pair]]:
+    """Yield each pair with the settings of both records."""
     settings = _settings_across(first, across)
     candidates: dict[Any, list[tuple[int, Record]]] = {}
     for place, group in enumerate(second):
         for record in group.records:
             candidates.setdefault(episode_key(record, across), []).append((place, record))
     for group in first:
-        can_pair = [can_compare(group, other, settings) for other in second]
+        joined = {
+            place: _join(group, other)
+            for place, other in enumerate(second)
+            if can_compare(group, other, settings)
+        }
         for record in group.records:
             of_episode = candidates.get(episode_key(record, across), [])
-            places = [place for place, (number, _) in enumerate(of_episode) if can_pair[number]]
+            places = [place for place, (number, _) in enumerate(of_episode) if number in joined]
             if places:
-                yield group, (record, of_episode.pop(places[0])[1])
+                number, other = of_episode.pop(places[0])
+                yield joined[number], (record, other)
+
+
+def _join(first: Group, second: Group) -> Settings:
+    """Return the settings of both groups; what only one recorded holds for both."""
+    joined = {}
+    for name in first.settings | second.settings:
+        values = dict.fromkeys(each.settings.get(name, ABSENT) for each in (first, second))
+        joined[name] = " and ".join(value for value in values if value != NOT_RECORDED) or NOT_RECORDED
+    return joined
 
 
 def _settings_across(groups: list[Group], across: str | None) -> tuple[str, ...]:
@@ -207,8 +270,8 @@ def _settings_across(groups: list[Group], across: str | None) -> tuple[str, ...]
 
 def _values_of(groups: list[Group]) -> Values:
     """Return {setting: its values in these groups}."""
-    names = groups[0].settings
-    return {name: {group.settings.get(name, NOT_RECORDED) for group in groups} for name in names}
+    names = {name: None for group in groups for name in group.settings}
+    return {name: {group.settings.get(name, ABSENT) for group in groups} for name in names}
 
 
 def _apart(first: Values, second: Values, across: Collection[str] = ()) -> list[str]:
@@ -216,13 +279,12 @@ def _apart(first: Values, second: Values, across: Collection[str] = ()) -> list[
 
     A setting that was not recorded keeps no episodes apart: an expert is shown no image, so OpenGL drew none.
     """
-    return [
-        name
-        for name, values in first.items()
-        if name not in (POLICY, *across)
-        and not values & second.get(name, set())
-        and NOT_RECORDED not in values | second.get(name, set())
-    ]
+    apart = []
+    for name in first | second:
+        values, others = first.get(name, {ABSENT}), second.get(name, {ABSENT})
+        if name not in (POLICY, *across) and not values & others and NOT_RECORDED not in values | others:
+            apart.append(name)
+    return apart
 
 
 def _why_none(first: list[Group], second: list[Group], across: str | None) -> str:

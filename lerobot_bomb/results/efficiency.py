@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_bomb.bootstrap import Estimate, sums_by
+from lerobot_bomb.bootstrap import Estimate
 from lerobot_bomb.results.inference import Inference
 from lerobot_bomb.results.record import Record
+from lerobot_bomb.stats import sums_by
 
 
 @dataclass(frozen=True)

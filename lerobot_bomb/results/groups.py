@@ -50,6 +50,12 @@ class Group:
         return [each for each in self.records if each.spec.perturbations != NONE]
 
     @property
+    def replaced(self) -> str:
+        """Sentence on the records of episodes that were run again; '' if there are none."""
+        number = self.num_replaced
+        return f"{number} records are replaced by later ones of the same episode" if number else ""
+
+    @property
     def missing_fields(self) -> tuple[str, ...]:
         """Fields of the newest protocol that the group's records do not have."""
         return self.record_type.versions[self.records[0].protocol_version]

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_bomb.bootstrap import Estimate, sums_by
+from lerobot_bomb.bootstrap import Estimate
+from lerobot_bomb.stats import sums_by
 
 
 @dataclass(frozen=True)

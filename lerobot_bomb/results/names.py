@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
 from lerobot_bomb.results.origin import NOT_RECORDED, PolicyIdentity
+from lerobot_bomb.tables import num_shared
 
 UNKNOWN = "policy not recorded"
 SHIPPED_PREFIX = "bomb:"  # of the names of checkpoints that come with the package
@@ -29,7 +30,7 @@ def policy_names(
     """
     known = [each or PolicyIdentity(UNKNOWN) for each in policies]
     names = [shipped_name(each.path or "") or each.type for each in known]
-    for parts in (_path_parts, _interventions, _weights, _settings):
+    for parts in (_path_parts, _interventions, _steps, _weights, _settings):
         names = _extended(names, known, parts)
     chosen = given or {}
     return numbered([chosen.get(policy_key(each), name) for each, name in zip(policies, names, strict=True)])
@@ -66,24 +67,19 @@ def _extended(names: list[str], policies: Sequence[PolicyIdentity], parts: Parts
 def _path_parts(policies: Sequence[PolicyIdentity]) -> list[str]:
     """Return the parts of the policies' paths between those that all begin and end with."""
     paths = [(each.path or "").strip("/").split("/") for each in policies]
-    first = _num_shared(paths)
+    first = num_shared(paths)
     paths = [path[first:] for path in paths]
-    last = _num_shared([path[::-1] for path in paths])
+    last = num_shared([path[::-1] for path in paths])
     return ["/".join(path[: len(path) - last]) for path in paths]
-
-
-def _num_shared(paths: Sequence[Sequence[str]]) -> int:
-    """Return how many parts all paths begin with."""
-    number = 0
-    for parts in zip(*paths, strict=False):
-        if len(set(parts)) > 1:
-            break
-        number += 1
-    return number
 
 
 def _interventions(policies: Sequence[PolicyIdentity]) -> list[str]:
     return [" ".join(f"with {name}" for name in each.interventions) for each in policies]
+
+
+def _steps(policies: Sequence[PolicyIdentity]) -> list[str]:
+    steps = [each.training_step for each in policies]
+    return ["" if step is None else f"step {step}" for step in steps]
 
 
 def _weights(policies: Sequence[PolicyIdentity]) -> list[str]:

@@ -73,6 +73,8 @@ class PolicyIdentity:
     settings_sha256: Sha256 | None = None
     base: str | None = None  # checkpoint under the adapters: a folder or USER/NAME@REVISION
     is_in_training: bool = False  # evaluated during a training: the weights are in no file
+    # step of the training that it was evaluated at; null: of none, or not recorded
+    training_step: Natural | None = None
     # episodes evaluated in one batch; arithmetic rounds differently in a batch of another size
     batch_size: Count | None = None
     batch_row: Natural | None = None  # row of this episode in the batch
@@ -87,6 +89,7 @@ class PolicyIdentity:
         notes = [f"{name} {sha256[:SHOWN_DIGITS]}" for name, sha256 in sums.items() if sha256]
         notes += [f"adapters of {self.base}"] if self.base else []
         notes += ["in training"] if self.is_in_training else []
+        notes += [f"step {self.training_step}"] if self.training_step is not None else []
         notes += [f"with {name}" for name in self.interventions]
         words = [self.type, *([f"{self.path}{revision}"] if self.path else [])]
         return " ".join([*words, *([f"({', '.join(notes)})"] if notes else [])])
@@ -100,7 +103,8 @@ class PolicyIdentity:
     def key(self) -> str:
         """Text that is equal for the same weights with the same settings, wherever they lie."""
         values = (self.type, self.weights_sha256, self.settings_sha256, self.base, self.is_in_training)
-        return json_list(*values, *((self.path, self.revision) if self.weights_sha256 is None else ()))
+        step = () if self.training_step is None else (self.training_step,)
+        return json_list(*values, *((self.path, self.revision) if self.weights_sha256 is None else ()), *step)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """Pairs of records of the same episode, by condition: how often does each succeed, and is it chance?"""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from lerobot_bomb.conditions import NONE
@@ -9,10 +10,10 @@ from lerobot_bomb.results.record import Record
 from lerobot_bomb.stats import (
     SIGNIFICANT,
     PairedCounts,
+    clustered_difference_interval,
     episodes_to_tell_apart,
     format_bounds,
     holm,
-    paired_difference_interval,
 )
 
 type Pair = tuple[Record, Record]  # one episode unperturbed and perturbed, or of two policies
@@ -28,15 +29,17 @@ class PairedComparison:
     p_value: float  # of the exact McNemar test, adjusted for the number of conditions
     num_conditions: int
 
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % interval of the second rate minus the first."""
-        return paired_difference_interval(self.counts)
+    @cached_property
+    def interval(self) -> tuple[float, float] | None:
+        """95 % interval of the second rate minus the first, clustered by start; None if all share one."""
+        differences = [second.is_success - first.is_success for first, second in self.pairs]
+        starts = [first.start_key for first, _ in self.pairs]
+        return clustered_difference_interval(self.counts, differences, starts)
 
     @property
     def num_needed(self) -> int | None:
         """Number of pairs for the test to find this difference; None if it did, or never will."""
-        if self.is_shown:
+        if self.is_significant:
             return None
         return episodes_to_tell_apart(self.counts, SIGNIFICANT / self.num_conditions)
 
@@ -46,9 +49,20 @@ class PairedComparison:
         return len({first.start_key for first, _ in self.pairs})
 
     @property
-    def is_shown(self) -> bool:
-        """True if the test shows a difference."""
+    def is_clustered(self) -> bool:
+        """True if several pairs share a start; the test takes them as independent, the interval does not."""
+        return self.num_starts < len(self.pairs)
+
+    @property
+    def is_significant(self) -> bool:
         return self.p_value < SIGNIFICANT
+
+    @property
+    def is_shown(self) -> bool:
+        """True if the test shows a difference, and the interval does too where it alone allows for starts."""
+        if not self.is_significant or not self.is_clustered:
+            return self.is_significant
+        return self.interval is not None and not self.interval[0] <= 0 <= self.interval[1]
 
     def describe_difference(self, unit: str = "") -> str:
         """Return '+25.0 [+3.8, +46.9]': second rate minus first in percentage points."""
@@ -108,8 +122,17 @@ def compare_family(suites: Sequence[Mapping[str, list[Pair]]]) -> list[list[Pair
     ]
 
 
-def describe_test(num_conditions: int) -> str:
-    """Describe the test of a p-value: 'exact McNemar test, adjusted for 11 conditions (Holm)'."""
-    if num_conditions == 1:
-        return "exact McNemar test of one condition, not adjusted"
-    return f"exact McNemar test, adjusted for {num_conditions} conditions (Holm)"
+def describe_test(compared: Collection[PairedComparison]) -> str:
+    """Describe the test of p-values: 'exact McNemar test, adjusted for 11 conditions (Holm)'."""
+    numbers = {each.num_conditions for each in compared}
+    if numbers == {1}:
+        test = "exact McNemar test of one condition, not adjusted"
+    else:
+        number = f" for {numbers.pop()} conditions" if len(numbers) == 1 else ""
+        test = f"exact McNemar test, adjusted{number} (Holm)"
+    return f"{test}, which takes pairs of one seed as independent" if are_clustered(compared) else test
+
+
+def are_clustered(compared: Iterable[PairedComparison]) -> bool:
+    """Return True if several pairs of a condition share a start."""
+    return any(each.is_clustered for each in compared)

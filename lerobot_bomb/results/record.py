@@ -70,6 +70,7 @@ class Record(ABC):
         "action_j3": None,
         "inference": None,
         "evaluation": None,
+        "policy.training_step": None,
         "policy.batch_size": None,
         "policy.batch_row": None,
         "policy.interventions": (),

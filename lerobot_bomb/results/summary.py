@@ -54,7 +54,7 @@ def _pair_line(compared: PairedComparison) -> str:
     counts, change = compared.counts, compared.describe_change()
     return (
         f"  {compared.condition}: {counts.n} pairs, {counts.only_first} lost, {counts.only_second} won, "
-        f"{format_p(compared.p_value)} ({describe_test(compared.num_conditions)})"
+        f"{format_p(compared.p_value)} ({describe_test([compared])})"
         f"{'; ' * bool(change)}{change}"
     )
 

@@ -14,6 +14,7 @@ from lerobot_bomb.compat.use import is_ours
 
 AGAIN = "The same command runs all of them again; lerobot-bomb sweep resumes"
 BEGIN = "begin_evaluation"  # method of our vector environments
+_STEPS: list[int] = []  # of the training that this process evaluated at, by `note_training_steps`
 
 
 def check_evaluations(check: Callable[[Any], None]) -> None:
@@ -101,6 +102,28 @@ def tell_of_evaluations() -> None:
         replace(module, "eval_policy", telling)
         replace(module, "rollout", filming)
         replace(module, "close_envs", closing)
+
+
+def note_training_steps() -> None:
+    """Let `evaluated_step` know the step of each evaluation during a training.
+
+    LeRobot's training names an evaluation's videos by it, before it makes the environments.
+    """
+
+    def around(usual: Callable[..., str]) -> Callable[..., str]:
+        def noted(step: int, *args: Any, **options: Any) -> str:
+            _STEPS[:] = [step]
+            return usual(step, *args, **options)
+
+        return noted
+
+    for module in _loaded_with("update_policy"):  # those that train
+        replace(module, "get_step_identifier", around)
+
+
+def evaluated_step() -> int | None:
+    """Return the step at which the training in this process is evaluated; None if it names none."""
+    return _STEPS[0] if _STEPS else None
 
 
 def _results_paths(envs: Mapping[str, Mapping[int, Any]]) -> list[str]:

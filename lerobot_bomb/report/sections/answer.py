@@ -1,7 +1,7 @@
 """Section `answer`: how often each policy succeeds, which is better, and what each condition costs."""
 
 from lerobot_bomb.conditions import NONE, AxisCondition
-from lerobot_bomb.report.cells import INTERVALS, points, rate
+from lerobot_bomb.report.cells import INTERVALS, PAIRED_INTERVAL, points, rate
 from lerobot_bomb.report.chart import MAX_SERIES, Chart
 from lerobot_bomb.report.dots import Block, Dot, DotColumn, dot_chart
 from lerobot_bomb.report.panels import Panel, Series
@@ -20,7 +20,7 @@ NOTE = (
     f"Success: with {INTERVALS}."
 )
 COST_NOTE = (
-    "Change: from the same episodes unperturbed, with Newcombe's 95 % interval for pairs; filled where "
+    f"Change: from the same episodes unperturbed, with {PAIRED_INTERVAL}; filled where "
     "p < 0.05 by the exact McNemar test, adjusted for the policy's conditions (Holm)."
 )
 SUMMARY_NOTE = (
@@ -46,7 +46,7 @@ def _statements(report: Report, panel: Panel) -> list[Statement]:
         first, second = sorted((told[0], other), key=lambda each: each.place)
         compared = report.compared(first.policy, second.policy)
         if compared is not None:
-            found.append(describe_comparison(first, second, compared))
+            found.append(describe_comparison(panel, first, second, compared))
     return found + [describe_series(each, panel) for each in told]
 
 
@@ -117,19 +117,16 @@ def _policy_block(panel: Panel) -> Block:
 
 
 def _rate_dot(found: Rate | None) -> Dot | None:
-    if found is None:
-        return None
-    if found.interval is None:
-        return Dot(100 * found.share, None, None)
-    low, high = found.interval
-    return Dot(100 * found.share, 100 * low, 100 * high)
+    return None if found is None else _dot(found.share, found.interval)
 
 
 def _cost_dot(found: PairedComparison | None) -> Dot | None:
-    if found is None:
-        return None
-    low, high = found.interval
-    return Dot(100 * found.counts.difference, 100 * low, 100 * high, found.is_shown)
+    return None if found is None else _dot(found.counts.difference, found.interval, found.is_shown)
+
+
+def _dot(share: float, interval: tuple[float, float] | None, is_filled: bool = True) -> Dot:
+    low, high = (None, None) if interval is None else (100 * bound for bound in interval)
+    return Dot(100 * share, low, high, is_filled)
 
 
 def _summary(report: Report) -> Table:
@@ -163,8 +160,8 @@ def conditions(series: Series) -> Table:
     note = f"Success in per cent, with {INTERVALS}."
     if costs:
         note += (
-            " Points: difference in percentage points from the same episodes unperturbed, with Newcombe's "
-            f"95 % interval for pairs; p: {describe_test(next(iter(costs.values())).num_conditions)}."
+            " Points: difference in percentage points from the same episodes unperturbed, with "
+            f"{PAIRED_INTERVAL}; p: {describe_test(costs.values())}."
         )
     header = ["condition", "success", "episodes", *(["points", "p"] if costs else [])]
     return Table(series.group.name, header, [row(condition) for condition in series.records], note)

@@ -2,18 +2,15 @@
 
 from itertools import combinations
 
-from lerobot_bomb.report.cells import points, rate
+from lerobot_bomb.report.cells import PAIRED_INTERVAL, points, rate
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
 from lerobot_bomb.results.comparison import Comparisons
-from lerobot_bomb.results.pairs import describe_test
+from lerobot_bomb.results.pairs import are_clustered, describe_test
 
 TITLE = "Two policies on the same episodes"
 MAX_PAIRS = 10  # of policies that are all compared
-NOTE = (
-    "Points: difference in percentage points, with Newcombe's 95 % interval for pairs, an approximation; "
-    "p: {test}. With few pairs they may disagree: then trust p."
-)
+NOTE = f"Points: difference in percentage points, with {PAIRED_INTERVAL}, an approximation; p: {{test}}."
 
 
 def section(report: Report) -> Section:
@@ -37,8 +34,8 @@ def _table(first: str, second: str, found: Comparisons) -> Table:
         ]
         for each in found.conditions
     ]
-    note = NOTE.format(test=describe_test(len(found.conditions)))
-    if any(each.num_starts < len(each.pairs) for each in found.conditions):
-        note += " Several pairs are of one seed, which points and p take as independent."
+    note = NOTE.format(test=describe_test(found.conditions))
+    if not are_clustered(found.conditions):
+        note += " With few pairs they may disagree: then trust p."
     header = ["condition", "A", "B", "B - A, points", "p", "pairs"]
     return Table(f"A: {first}; B: {second}", header, rows, note)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lerobot_bomb.report.chart import COLORS, INK, MAX_SERIES, WIDTH, Chart, chart_text, draw, tidy
+from lerobot_bomb.report.chart import COLORS, INK, MAX_SERIES, WIDTH, Chart, chart_texts, draw, tidy
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import MAX_TOLD, Cell, Section, Statement, Table
 from lerobot_bomb.results.bomb import EpisodeResult, put_down
@@ -79,10 +79,10 @@ def _row(name: tuple[str, str], errors: list[float]) -> list[Cell]:
 def _curves(title: str, shown: list[str], errors: Errors, tolerances: list[float]) -> str:
     def paint(figure: "Figure") -> None:
         axes = figure.subplots()
-        for (group, kind), found in errors.items():
+        labels = chart_texts([f"{group}, {kind}" for group, kind in errors])
+        for ((group, kind), found), label in zip(errors.items(), labels, strict=True):
             if group in shown:
                 style, color = "-" if kind == "unperturbed" else ":", COLORS[shown.index(group)]
-                label = chart_text(f"{group}, {kind}")
                 # of very many stones, so many steps that none is seen
                 counts = np.linspace(0, len(found), min(len(found), MAX_STEPS) + 1).astype(int)
                 errors_mm = np.maximum(found, SMALLEST_MM)[np.maximum(counts - 1, 0)]

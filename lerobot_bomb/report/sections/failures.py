@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from lerobot_bomb.report.cells import count, rate
-from lerobot_bomb.report.chart import COLORS, INK, MAX_BARS, WIDTH, Chart, chart_text, draw, tidy
+from lerobot_bomb.report.chart import COLORS, INK, MAX_BARS, WIDTH, Chart, chart_text, chart_texts, draw, tidy
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import MAX_TOLD, Cell, Section, Statement, Table
 from lerobot_bomb.results.bomb import are_placed, is_grounded, put_down
@@ -95,7 +95,7 @@ def stacked(title: str, classes: Sequence[str], bars: Table) -> str:
                 if share >= MAX_LABEL_SHARE:
                     axes.text(left[row] + share / 2, row, f"{share:.0f}", ha="center", va="center")
             left = [start + share for start, share in zip(left, shares, strict=True)]
-        axes.set_yticks(range(len(rows)), [chart_text(row[0].text) for row in rows])
+        axes.set_yticks(range(len(rows)), chart_texts([row[0].text for row in rows]))
         axes.set_ylim(len(rows) - 0.4, -0.6)
         axes.set_xlim(0, 100)
         axes.set_xlabel("per cent of episodes")

@@ -48,7 +48,7 @@ def _tables(own: Policy, other: Policy) -> Iterable[Table]:
         table.append([Cell(each.condition), *cells, Cell(str(len(each.pairs)), len(each.pairs))])
     grounding = ["right intersection, its own", "right intersection, another"] if is_placed else []
     header = ["condition", "its own", "another", "points", "p", *grounding, "pairs"]
-    note = NOTE.format(test=describe_test(len(found.conditions)))
+    note = NOTE.format(test=describe_test(found.conditions))
     yield Table(f"{own.name}; with another instruction: {other.name}", header, table, note)
 
 

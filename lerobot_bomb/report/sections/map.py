@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from lerobot_bomb.conditions import NONE
-from lerobot_bomb.report.chart import Chart, chart_text, draw
+from lerobot_bomb.report.chart import Chart, chart_text, chart_texts, draw
 from lerobot_bomb.report.panels import Panel, Series
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
@@ -48,7 +48,7 @@ def _cell(series: Series, condition: str) -> Cell:
 
 
 def _draw(title: str, table: Table) -> str:
-    names = [chart_text(row[0].text) for row in table.rows]
+    names = chart_texts([row[0].text for row in table.rows])
     num_rows, num_columns = len(table.rows), len(table.header) - 1
     left = 0.4 + 0.075 * max(map(len, names))
     top = 0.2 + 0.065 * max(map(len, map(chart_text, table.header)))
