@@ -205,8 +205,11 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         run, size = self._run, self._render_options.image_size
         goals = run.judge.goals()
         goal = goals[min(run.judge.num_made, len(goals) - 1)]
+        radius_m = run.episode.layout.stone_radius_m
         return {
-            camera: object_masks(run.scene, self._camera_renderer, camera, size, goal.stone, goal.xyz[:2])
+            camera: object_masks(
+                run.scene, self._camera_renderer, camera, size, goal.stone, goal.xyz[:2], radius_m
+            )
             for camera in CAMERAS
         }
 
