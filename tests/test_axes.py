@@ -2,6 +2,7 @@
 """Perturbation axes: what they do to an episode, and what they leave alone."""
 
 import itertools
+import re
 from dataclasses import fields
 from pkgutil import resolve_name
 from typing import Any
@@ -20,6 +21,7 @@ from lerobot_bomb.bomb.perturbations import AXES, NUISANCES
 from lerobot_bomb.bomb.suites.place import FORMS, STONE
 from lerobot_bomb.conditions import MAX_LEVEL
 from lerobot_bomb.envs.photometric import Photometric
+from lerobot_env_bomb.alternatives import alternatives
 from lerobot_env_bomb.axes.dynamics import Dynamics
 from lerobot_env_bomb.axes.language import Wording
 from lerobot_env_bomb.axes.light import Light
@@ -345,3 +347,22 @@ def test_every_form_occurs_and_never_names_the_target_as_the_other_place() -> No
 def test_every_axis_names_its_transform() -> None:
     kinds = [resolve_name(axis.transform) for axis in AXES.values()]
     assert len(set(kinds)) == len(AXES) and all(issubclass(kind, Transform) for kind in kinds)
+
+
+@pytest.mark.parametrize("level", [3, 5])
+def test_alternatives_never_forbid_what_they_ask(level: int) -> None:
+    episodes = [episode(seed, f"language:{level}") for seed in range(200)]
+    drawn = [(drawn_of(Wording, each.spec.seed, f"language:{level}"), each) for each in episodes]
+    named = [(wording, target) for wording, each in drawn for _, target in alternatives(each).values()]
+    assert len(named) == 600
+    assert all(target != wording.other for wording, target in named)
+
+
+def test_alternatives_of_a_named_stone_change_its_place() -> None:
+    for seed in range(20):
+        drawn = sample_episode(EpisodeSpec(seed, "object"))
+        others = alternatives(drawn)
+        assert [*others] == ["row", "column"]
+        for instruction, (row, column) in others.values():
+            assert drawn.turns[0].words["stone"] in instruction
+            assert {str(row), str(column)} == set(re.findall(r"\d", instruction))

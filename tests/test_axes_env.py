@@ -157,3 +157,14 @@ def test_the_expert_places_stones_under_perturbation(under: Under, condition: st
             ended = terminated or truncated
         assert info["is_success"], (seed, info)
         assert env.episode_result().levels == sample_episode(env.episode_result().spec).perturbation.levels
+
+
+def test_the_target_mask_is_as_large_as_stones(under: Under) -> None:
+    env = under("object:5", target=(2, 2))
+    num_pixels: dict[float, int] = {}  # by radius: 11 or 15 mm
+    for seed in range(8):
+        env.reset(seed=seed)
+        radius_m = env.privileged_state().stone_radius_m
+        num_pixels[radius_m] = int(env.object_masks()["workspace"]["target"].sum())
+    small, large = (num_pixels[radius_m] for radius_m in sorted(num_pixels))
+    assert large / small == pytest.approx((15 / 11) ** 2, rel=0.3)  # of a few pixels

@@ -107,6 +107,13 @@ def test_an_episode_fails_in_one_way() -> None:
         ({"init_states": False}, "--env.init_states=false"),
         ({"is_libero_plus": True}, "--env.is_libero_plus=true"),
         ({"control_mode": "delta"}, "--env.control_mode"),
+        *(
+            (
+                {"control_mode": "absolute", "perturbations": ["none", condition]},
+                f"--env.perturbations={condition} with --env.control_mode=absolute",
+            )
+            for condition in ("dynamics:1", "camera:1+dynamics:2", "all:3")
+        ),
         ({"episode_length": 0}, "--env.episode_length=0"),
     ],
 )

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,9 @@ from lerobot_bomb.bomb.commands import INTERSECTIONS, draw_command, is_heldout
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.go import is_legal_position
-from lerobot_bomb.bomb.move import TRAY, distance_m
+from lerobot_bomb.bomb.move import TRAY, Aim, distance_m
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_bomb.bomb.privileged_state import PrivilegedState
+from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 from lerobot_bomb.bomb.suite import Episode, find_suite, specs_of_tasks
 from lerobot_bomb.bomb.suites import goal as goal_suite
 from lerobot_bomb.bomb.suites import long as long_suite
@@ -256,53 +256,34 @@ def test_the_expert_does_every_task_without_an_idle_step(suite: str, task_id: in
         np.testing.assert_allclose(expert_action(moment.state), moment.action, atol=1e-3)  # memoryless
 
 
-def in_another_order(state: PrivilegedState, step: int) -> np.ndarray:
-    return expert_action(replace(state, goals=state.goals[::-1]))
+def follow(episode: Episode, aims: Sequence[Aim]) -> Callable[[PrivilegedState, int], np.ndarray]:
+    """Return an agent that follows these aims as the expert follows its own."""
+    height_m = episode.layout.rest_height_m
+    goals = tuple(Goal(np.array([*aim.xy, height_m]), aim.stone) for aim in aims)
+    return lambda state, step: expert_action(replace(state, goals=goals))
 
 
 def test_moves_that_have_no_order_may_be_made_in_any() -> None:
-    seed = next(
-        seed
-        for seed in range(99)
-        if len(sample_episode(EpisodeSpec(seed, "goal", task_id=CLEAR_ROW)).aims) == 2
-    )
-    spec = EpisodeSpec(seed, "goal", task_id=CLEAR_ROW)
-    num_goals = find_suite("goal").num_goals
-
-    def act(state: PrivilegedState, step: int) -> np.ndarray:
-        goals = state.goals[1::-1]
-        return expert_action(replace(state, goals=goals + goals[-1:] * (num_goals - 2)))
-
-    *_, last = moments_of(spec, act)
+    specs = (EpisodeSpec(seed, "goal", task_id=CLEAR_ROW) for seed in range(99))
+    spec = next(spec for spec in specs if len(sample_episode(spec).aims) == 2)
+    episode = sample_episode(spec)
+    *_, last = moments_of(spec, follow(episode, episode.aims[::-1]))
     assert last.info["is_success"]
 
 
 def test_either_stone_of_a_swap_may_go_aside() -> None:
     spec = EpisodeSpec(0, "goal", task_id=SWAP)
     episode = sample_episode(spec)
-    first, second = episode.aims[0].stone, episode.aims[1].stone
-    xy = standing(episode)
-
-    def act(state: PrivilegedState, step: int) -> np.ndarray:
-        aside, second_there, first_there = state.goals
-        height = aside.xyz[2]
-        places = {
-            stone: np.array([*BOARD.intersection_xy(*intersection), height])
-            for stone, intersection in xy.items()
-        }
-        goals = (
-            replace(aside, stone=second),
-            replace(second_there, stone=first, xyz=places[second]),
-            replace(first_there, stone=second, xyz=places[first]),
-        )
-        return expert_action(replace(state, goals=goals))
-
-    *_, last = moments_of(spec, act)
+    aside, second_there, first_there = episode.aims
+    aims = (replace(aside, stone=second_there.stone), first_there, second_there)
+    *_, last = moments_of(spec, follow(episode, aims))
     assert last.info["is_success"]
 
 
 def test_moves_in_the_wrong_order_fail() -> None:
-    *_, last = moments_of(EpisodeSpec(0, "long", task_id=OPENING_OF_4), in_another_order)
+    spec = EpisodeSpec(0, "long", task_id=OPENING_OF_4)
+    episode = sample_episode(spec)
+    *_, last = moments_of(spec, follow(episode, episode.aims[::-1]))
     assert not last.info["is_success"]
     assert last.info["failure"] in ("wrong_stone", "wrong_intersection")
 
@@ -321,12 +302,8 @@ def test_any_stone_of_the_colour_will_do() -> None:
     same = [aim.stone for aim in episode.aims if color_of(episode, aim.stone) == color_of(episode, 0)]
     other = dict(zip(same, same[::-1], strict=True))
 
-    def act(state: PrivilegedState, step: int) -> np.ndarray:
-        return expert_action(
-            replace(state, goals=tuple(replace(g, stone=other.get(g.stone, g.stone)) for g in state.goals))
-        )
-
-    *_, last = moments_of(spec, act)
+    aims = [replace(aim, stone=other.get(aim.stone, aim.stone)) for aim in episode.aims]
+    *_, last = moments_of(spec, follow(episode, aims))
     assert last.info["is_success"] and len(same) == 2
 
 

@@ -1,5 +1,7 @@
 """Phases of an episode, by what the gripper does."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -85,3 +87,12 @@ def test_a_missed_grasp_is_followed_by_another_reach() -> None:
 @pytest.mark.parametrize("states", [[], [state((0.1, 0.0), HIGH_M, closed=False)]])
 def test_each_state_has_a_phase(states: list[PrivilegedState]) -> None:
     assert len(phases_of(states)) == len(states)
+
+
+def test_fingers_are_around_a_tall_stone() -> None:
+    low = state(TRAY_XY, 0.0, closed=False)
+    rest_m = REST_M + 0.00125  # 5.75 mm above the board
+    stone_xyz, goal = low.stone_xyz.copy(), Goal(np.array([*TARGET_XY, rest_m]), 0)
+    stone_xyz[:2, 2] = rest_m
+    over_middle = stone_xyz[0] + np.array([0, 0, 0.005])
+    assert names([replace(low, gripper_xyz=over_middle, stone_xyz=stone_xyz, goals=(goal,))]) == ["grasp 0"]

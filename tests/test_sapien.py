@@ -108,7 +108,7 @@ def test_pads_are_where_mujoco_has_them_and_touch_what_they_close_on(robot: str)
     episode = sample_episode(replace(SPEC, robot=robot))
     scene = Scene(robot, "sapien")
     scene.reset(episode.layout)
-    stone = episode.stone
+    stone = episode.aims[0].stone
     above = np.array([*episode.layout.stone_xy[stone], 0.1])
     for target, is_open in [(above, True), (above - [0, 0, 0.094], True), (above - [0, 0, 0.094], False)]:
         for _ in range(8):

@@ -99,7 +99,7 @@ def test_exactly_one_stone_and_one_place_satisfy_the_instruction(
     suite: str, condition: str, seed: int
 ) -> None:
     episode = sample_episode(EpisodeSpec(seed, suite, perturbations=condition))
-    assert meant_stones(episode.instruction, episode) == {episode.stone}
+    assert meant_stones(episode.instruction, episode) == {episode.aims[0].stone}
     assert meant_places(episode.instruction, episode) == {episode.target}
 
 
@@ -158,7 +158,7 @@ def test_the_place_that_is_named_changes_nothing_in_the_tray(seed: int, row: int
     spec = EpisodeSpec(seed, "object", task_id=0)
     drawn, given_target = sample_episode(spec), sample_episode(replace(spec, target=(row, column)))
     number = len(drawn.supply)
-    assert given_target.stone == drawn.stone and given_target.supply == drawn.supply
+    assert given_target.aims[0].stone == drawn.aims[0].stone and given_target.supply == drawn.supply
     assert (given_target.layout.stone_xy[:number] == drawn.layout.stone_xy[:number]).all()
     assert (given_target.layout.gripper_xyz == drawn.layout.gripper_xyz).all()
 

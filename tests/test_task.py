@@ -115,8 +115,8 @@ def test_the_instruction_names_colour_row_and_column() -> None:
 
 
 def test_the_target_is_where_its_row_and_column_say() -> None:
-    corner = sample_episode(EpisodeSpec(seed=0, target=(0, 4))).goals_after(0)[0].xyz
-    np.testing.assert_allclose(corner, [0.09, 0.09, 0.0095], atol=1e-12)
+    corner = sample_episode(EpisodeSpec(seed=0, target=(0, 4))).aims[0].xy
+    np.testing.assert_allclose(corner, [0.09, 0.09], atol=1e-12)
 
 
 def test_splits_share_no_intersection_and_no_instruction() -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from lerobot_bomb.bomb.board import BOARD, COLORS, Intersection
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.suite import find_suite
+from lerobot_env_bomb.axes.language import Wording
 from lerobot_env_bomb.perturb import PerturbedEpisode
 
 
@@ -21,7 +22,7 @@ def alternatives(episode: PerturbedEpisode) -> dict[str, tuple[str, Intersection
     asked = {
         "row": [{"target": ((row + step) % BOARD.num_lines, column)} for step in steps],
         "column": [{"target": (row, (column + step) % BOARD.num_lines)} for step in steps],
-        "color": [{"color": color} for color in COLORS if color != episode.color],
+        "color": [{"color": color} for color in COLORS if color != episode.color and _says_color(episode)],
     }
     found = {word: next(_reworded(episode, changes), None) for word, changes in asked.items()}
     return {word: other for word, other in found.items() if other is not None}
@@ -29,13 +30,20 @@ def alternatives(episode: PerturbedEpisode) -> dict[str, tuple[str, Intersection
 
 def _reworded(episode: PerturbedEpisode, changes: list[dict]) -> Iterator[tuple[str, Intersection]]:
     """Yield the instructions and targets of the changes for which the split has an episode."""
-    suite = find_suite(episode.spec.suite)
-    same = {"target": episode.target, "color": episode.color}
+    suite, wording = find_suite(episode.spec.suite), episode.perturbation.of(Wording)
+    stone = {"color": episode.color} if _says_color(episode) else {"task_id": episode.task_id}
     for change in changes:
-        spec: EpisodeSpec = replace(episode.spec, **same | change)
+        spec: EpisodeSpec = replace(episode.spec, **{"target": episode.target, **stone, **change})
         try:
-            other = suite.sample(spec)
+            suite.check(spec)
         except ValueError:
             continue
-        assert other.target is not None
-        yield episode.perturbation.reword(other.instruction, other), other.target
+        other = suite.sample(spec)
+        # the words would name this target as the one that is not meant
+        if other.target is not None and (wording is None or wording.other != other.target):
+            yield episode.perturbation.reword(other.instruction, other), other.target
+
+
+def _says_color(episode: PerturbedEpisode) -> bool:
+    """Return True if the instruction names the stone by its colour alone."""
+    return "color" in episode.turns[0].words

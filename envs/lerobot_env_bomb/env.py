@@ -48,12 +48,6 @@ class _Run:
     episode: PerturbedEpisode
     judge: Judge
     actuator: Actuator
-    moves_before: int = 0  # that a static scene shows as made
-
-    @property
-    def num_made(self) -> int:
-        """Number of moves that have been made."""
-        return self.moves_before + self.judge.num_made
 
 
 class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
@@ -122,11 +116,10 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         self._current_run = _Run(
             scene=scene,
             episode=episode,
-            judge=Judge(episode, self._spec.fps, now),
+            judge=Judge(episode, self._spec.fps, now, start.made),
             actuator=Actuator(self._spec.control_mode, now.gripper_xyz, dynamics, episode.spec.seed),
-            moves_before=start.num_made,
         )
-        self.task_description = episode.instruction_after(start.num_made)
+        self.task_description = episode.instruction_after(len(start.made))
 
     def _advance(self, run: _Run, action: np.ndarray) -> Transition:
         target_xyz, open_fingers = run.actuator.command(action, self._now.gripper_xyz)
@@ -194,7 +187,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return PrivilegedState(
             gripper_xyz=now.gripper_xyz,
             finger_opening=now.finger_opening,
-            goals=run.episode.goals_after(run.num_made),
+            goals=run.judge.goals(),
             stone_xyz=now.stone_xyz,
             stone_is_white=run.episode.layout.stone_is_white,
             stone_in_play=run.episode.layout.stone_in_play,
@@ -210,10 +203,13 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
     def object_masks(self) -> dict[str, dict[str, np.ndarray]]:
         """{camera: {object: (H, W) bool}}: the pixels of each object in the observation's images."""
         run, size = self._run, self._render_options.image_size
-        goals = run.episode.goals_after(run.judge.num_made)
+        goals = run.judge.goals()
         goal = goals[min(run.judge.num_made, len(goals) - 1)]
+        radius_m = run.episode.layout.stone_radius_m
         return {
-            camera: object_masks(run.scene, self._camera_renderer, camera, size, goal.stone, goal.xyz[:2])
+            camera: object_masks(
+                run.scene, self._camera_renderer, camera, size, goal.stone, goal.xyz[:2], radius_m
+            )
             for camera in CAMERAS
         }
 

@@ -13,7 +13,13 @@ BOARD_GEOMS = ("board", "board_surface")
 
 
 def object_masks(
-    scene: Scene, renderer: Renderer, camera: str, size: int, stone: int, target_xy: np.ndarray
+    scene: Scene,
+    renderer: Renderer,
+    camera: str,
+    size: int,
+    stone: int,
+    target_xy: np.ndarray,
+    stone_radius_m: float,
 ) -> dict[str, np.ndarray]:
     """{object: (size, size) bool}; every pixel belongs to exactly one, besides the board's halves.
 
@@ -27,7 +33,7 @@ def object_masks(
     stones = [model.body(stone_name(index)).id for index in range(NUM_STONES)]
     is_board = np.isin(geom, [model.geom(name).id for name in BOARD_GEOMS])
     xy = _on_plane(scene, camera, size, BOARD.thickness_m)
-    is_target = is_board & (np.linalg.norm(xy - target_xy, axis=-1) <= BOARD.stone_radius_m)
+    is_target = is_board & (np.linalg.norm(xy - target_xy, axis=-1) <= stone_radius_m)
     is_other = np.isin(body, stones[:stone] + stones[stone + 1 :])
     is_gripper = (geom >= 0) & (body > 0) & ~np.isin(body, stones)  # body 0 is the world
     masks = {

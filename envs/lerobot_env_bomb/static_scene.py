@@ -6,7 +6,7 @@ import numpy as np
 
 from lerobot_bomb.bomb.expert import FLOOR_M, GRASP_DEPTH_M, SQUEEZE_M
 from lerobot_bomb.bomb.layout import Layout
-from lerobot_bomb.bomb.move import Aim
+from lerobot_bomb.bomb.move import Aim, Made
 from lerobot_bomb.bomb.observation import WORKSPACE_HIGH_M, WORKSPACE_LOW_M
 from lerobot_bomb.bomb.suite import Episode
 from lerobot_bomb.bomb.suites.object import MARGIN_M
@@ -23,7 +23,7 @@ class StaticScene:
     """Scene in the middle of an episode: where everything is, and which moves have been made."""
 
     layout: Layout
-    num_made: int  # moves that have been made
+    made: Made  # moves that have been made
     held: int | None  # stone between the fingers
     held_xyz: np.ndarray  # (3,) metres, its centre
 
@@ -35,15 +35,15 @@ class StaticScene:
 
 def starting_scene(episode: Episode) -> StaticScene:
     """Return the scene at the start of an episode."""
-    return StaticScene(episode.layout, num_made=0, held=None, held_xyz=np.zeros(3))
+    return StaticScene(episode.layout, made={}, held=None, held_xyz=np.zeros(3))
 
 
 def draw_static(episode: Episode, rng: np.random.Generator) -> StaticScene:
     """Draw a scene: some of the expert's moves made, the gripper anywhere, the next stone held or not."""
     num_made = int(rng.integers(len(episode.aims)))
-    made, aim = episode.aims[:num_made], episode.aims[num_made]
+    aims, aim = episode.aims[:num_made], episode.aims[num_made]
     stone_xy = episode.layout.stone_xy.copy()
-    for each in made:
+    for each in aims:
         stone_xy[each.stone] = each.xy
     layout = replace(episode.layout, stone_xy=stone_xy)
     is_held = rng.random() < HELD_RATE
@@ -55,9 +55,9 @@ def draw_static(episode: Episode, rng: np.random.Generator) -> StaticScene:
     held_xyz = gripper_xyz + np.array([0.0, 0.0, GRASP_DEPTH_M])
     held_xyz += rng.uniform(-GRIP_ERROR_M, GRIP_ERROR_M, 3)
     held_xyz[2] = max(held_xyz[2], layout.rest_height_m)
-    return StaticScene(
-        replace(layout, gripper_xyz=gripper_xyz), num_made, aim.stone if is_held else None, held_xyz
-    )
+    made: Made = {number: (each.stone, each.place) for number, each in enumerate(aims)}
+    held = aim.stone if is_held else None
+    return StaticScene(replace(layout, gripper_xyz=gripper_xyz), made, held, held_xyz)
 
 
 def _anywhere(layout: Layout, aim: Aim, is_held: bool, rng: np.random.Generator) -> np.ndarray:

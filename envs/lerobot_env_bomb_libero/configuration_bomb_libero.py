@@ -14,6 +14,7 @@ from lerobot_bomb.checkpoints.acting import acting_config
 from lerobot_bomb.checkpoints.env_config import EvaluatedEnv
 from lerobot_bomb.checkpoints.interface import Interface
 from lerobot_bomb.checkpoints.libero_orientation import OrientationCheck
+from lerobot_bomb.conditions import AxisCondition
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.libero.assets import SUITES, prepare_libero
 from lerobot_bomb.libero.episode import LIBERO_FPS, RENDER_PRESETS, STATE_DIM, TASKS_PER_SUITE, LiberoSpec
@@ -40,7 +41,18 @@ class BombLiberoEnvConfig(EvaluatedEnv, LiberoEnv):
             raise ValueError("--env.is_libero_plus=true: its perturbations are other ones; drop it")
         one_of("--env.control_mode", self.control_mode, CONTROL_MODES)
         one_of("--env.render_preset", self.render_preset, RENDER_PRESETS)
-        _ = self.groups
+        for specs in self.groups.values():
+            for spec in specs.values():
+                self._check_control(spec.condition)
+
+    def _check_control(self, condition: AxisCondition) -> None:
+        """Raise a ValueError for noise and latency of poses, which `dynamics` defines for motions."""
+        if self.control_mode == "absolute" and any(axis == "dynamics" for axis, *_ in condition.ranges):
+            raise ValueError(
+                f"--env.perturbations={condition} with --env.control_mode=absolute: noise and latency of "
+                "dynamics are of relative motions; name the other axes alone, or set "
+                "--env.control_mode=relative"
+            )
 
     def _declare_features(self) -> None:
         LiberoEnv.__post_init__(self)

@@ -1,25 +1,32 @@
 """Judge of an episode: follows the moves of its plans, and says how it ended."""
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, NUM_STONES
 from lerobot_bomb.bomb.episode import COLLATERAL_TOLERANCE_MM, DROP_HEIGHT_M, OFF_BOARD_M, Failure, Stage
+from lerobot_bomb.bomb.goals import Course, course_goals
 from lerobot_bomb.bomb.layout import SceneState
-from lerobot_bomb.bomb.move import TRAY, Move, Place, Plan, distance_m
-from lerobot_bomb.bomb.suite import Episode
+from lerobot_bomb.bomb.move import (
+    TRAY,
+    Made,
+    Move,
+    Place,
+    Plan,
+    distance_m,
+    open_moves,
+    places_left,
+    stones_left,
+)
+from lerobot_bomb.bomb.privileged_state import Goal
+from lerobot_bomb.bomb.suite import Episode, find_suite
 
 REST_S = 0.5  # a stone that was carried and then rests this long has been put down
 REST_SPEED_M_S = 0.005  # below it a stone rests
 LIFT_M = 0.010  # above its resting height a held stone counts as lifted
 FLAT_TOLERANCE_M = 0.003  # of the height at rest; a stone that leans or lies on another one is higher
 V0_TOLERANCE_MM = 26.0  # of the original benchmark's rule
-
-
-# moves that have been made: {number in the plan: (stone, place)}
-type Made = dict[int, tuple[int, Place]]
 
 
 class Judge:
@@ -33,7 +40,15 @@ class Judge:
     10 mm from where it stood or was put down.
     """
 
-    def __init__(self, episode: Episode, fps: int, start: SceneState):
+    def __init__(self, episode: Episode, fps: int, start: SceneState, made: Made):
+        """Judge an episode from its start.
+
+        Args:
+            episode: what is asked for.
+            fps: updates per second.
+            start: snapshot at the start.
+            made: moves of the first plan that the start shows as made.
+        """
         self.stage = Stage.START
         self.failure: Failure | None = None
         self.is_success = False
@@ -41,10 +56,11 @@ class Judge:
         self.collateral_mm = 0.0
         self._episode = episode
         self._fps = fps
-        self._plans: list[tuple[Plan, Made]] = [(plan, {}) for plan in episode.plans]
+        plans = episode.plans[:1] if made else episode.plans
+        self._plans: list[tuple[Plan, Made]] = [(plan, made) for plan in plans]
         self._is_complete = False  # the last move has been made, which the plans still lack
-        self._stone = episode.stone  # the one that is moved, or is to be moved next
         self._movable = self._find_movable()
+        self._stone = episode.aims[len(made)].stone  # the one that is moved, or is to be moved next
         self._left_xyz = start.stone_xyz.copy()  # where each stone stood or was put down
         self._now = start
         self._was_lifted: np.ndarray = np.zeros(NUM_STONES, dtype=bool)
@@ -70,6 +86,19 @@ class Judge:
     def nearest_intersection(self) -> tuple[int, int]:
         """(row, column) of the intersection nearest to the stone that is moved."""
         return BOARD.nearest_intersection(self._now.stone_xyz[self._stone, :2])
+
+    def goals(self) -> tuple[Goal, ...]:
+        """Return the expert's goals, as far as instructions have named them: those reached, then the others.
+
+        There are always `Suite.num_goals`: the last one is repeated if need be.
+        """
+        by_turns = len(self._episode.turns) > 1
+        courses = [
+            self._course(plan[: len(made) + 1] if by_turns else plan, made) for plan, made in self._plans
+        ]
+        course = max(courses, key=lambda each: (len(each.lying), each.carried is not None))
+        goals = tuple(course_goals(course, self._episode.layout, self._now.stone_xyz))
+        return goals + goals[-1:] * (find_suite(self._episode.spec.suite).num_goals - len(goals))
 
     def update(self, now: SceneState) -> bool:
         """Update with the state after a control step; return True if the episode has ended."""
@@ -113,18 +142,33 @@ class Judge:
         else:
             self.failure = Failure.DROPPED if was_lifted else Failure.MISSED_GRASP
 
-    def _open_moves(self, plan: Plan, made: Made) -> Iterator[tuple[int, Move]]:
-        for number, move in enumerate(plan):
-            if number not in made and move.after <= made.keys():
-                yield number, move
+    def _course(self, plan: Plan, made: Made) -> Course:
+        """Return how far a plan has come, by what lies in place and what the fingers carry."""
+        is_held, lying = self._now.stone_touched.all(axis=1), dict(made)
+        for number, move in open_moves(plan, lying):  # a move that lies in place opens later ones
+            in_place = (
+                (stone, place)
+                for stone in sorted(stones_left(move, lying))
+                if self._is_flat(stone) and not is_held[stone]
+                for place in self._places_under(stone, move, lying)
+            )
+            if (found := next(in_place, None)) is not None:
+                lying[number] = found
+        carried = (
+            (number, stone)
+            for number, move in open_moves(plan, lying)
+            for stone in sorted(stones_left(move, lying))
+            if is_held[stone] or self._was_lifted[stone]
+        )
+        return Course(plan, made, lying, next(carried, None))
 
     def _find_movable(self) -> set[int]:
         """Return the stones of open moves."""
         return {
             stone
             for plan, made in self._plans
-            for _, move in self._open_moves(plan, made)
-            for stone in _stones_left(move, made)
+            for _, move in open_moves(plan, made)
+            for stone in stones_left(move, made)
         }
 
     def _places(self) -> set[Place]:
@@ -132,9 +176,9 @@ class Judge:
         return {
             place
             for plan, made in self._plans
-            for _, move in self._open_moves(plan, made)
-            if self._stone in _stones_left(move, made)
-            for place in _places_left(move, made)
+            for _, move in open_moves(plan, made)
+            if self._stone in stones_left(move, made)
+            for place in places_left(move, made)
         }
 
     def _follow(self, touched: np.ndarray, held: np.ndarray) -> None:
@@ -174,13 +218,16 @@ class Judge:
         """Return the plans that have a move for this stone to where it lies, with that move made."""
         fitting = []
         for plan, made in self._plans:
-            for number, move in self._open_moves(plan, made):
-                if stone in _stones_left(move, made):
-                    there = [place for place in _places_left(move, made) if self._is_at(stone, place)]
-                    if there:
-                        fitting.append((plan, {**made, number: (stone, there[0])}))
-                        break
+            for number, move in open_moves(plan, made):
+                there = self._places_under(stone, move, made) if stone in stones_left(move, made) else []
+                if there:
+                    fitting.append((plan, {**made, number: (stone, there[0])}))
+                    break
         return fitting
+
+    def _places_under(self, stone: int, move: Move, made: Made) -> list[Place]:
+        """Return the places of a move on which a stone lies."""
+        return [place for place in places_left(move, made) if self._is_at(stone, place)]
 
     def _judge_placement(self, stone: int) -> bool:
         """Judge a stone that has been put down; return True if the episode has ended."""
@@ -221,8 +268,8 @@ class Judge:
         return all(
             move.is_slid
             for plan, made in self._plans
-            for _, move in self._open_moves(plan, made)
-            if stone in _stones_left(move, made)
+            for _, move in open_moves(plan, made)
+            if stone in stones_left(move, made)
         )
 
     def _was_dropped(self, stone: int) -> bool:
@@ -234,13 +281,3 @@ def is_off_board(xy: np.ndarray) -> bool:
     """Return True if a world xy, in metres, is too far from every intersection for a stone to be placed."""
     off_m = np.linalg.norm(xy - BOARD.intersection_xy(*BOARD.nearest_intersection(xy)))
     return bool(off_m > OFF_BOARD_M)
-
-
-def _stones_left(move: Move, made: Made) -> frozenset[int]:
-    """Return the stones that may still make a move."""
-    return move.stones if len(move.stones) == 1 else move.stones - {stone for stone, _ in made.values()}
-
-
-def _places_left(move: Move, made: Made) -> frozenset[Place]:
-    """Return the places of a move that no stone has been put on yet."""
-    return move.places - {place for _, place in made.values() if place != TRAY}

@@ -1,6 +1,6 @@
 """Moves that an episode asks for: each move of a plan takes a stone to a place."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,8 @@ class Move:
 
 
 type Plan = tuple[Move, ...]  # all of its moves are to be made, each after those in its `after`
+# moves that have been made: {number in the plan: (stone, place)}
+type Made = dict[int, tuple[int, Place]]
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,12 @@ class Aim:
     stone: int
     xy: tuple[float, float]  # metres
     is_slid: bool = False
+
+    @property
+    def place(self) -> Place:
+        """The place that the aim lies on."""
+        xy = np.array(self.xy)
+        return TRAY if distance_m(xy, TRAY) == 0 else BOARD.nearest_intersection(xy)
 
 
 def aim_at(stone: int, intersection: Intersection, is_slid: bool = False) -> Aim:
@@ -51,6 +59,23 @@ def in_order(*moves: Move) -> Plan:
         Move(move.stones, move.places, frozenset(range(number)), move.is_slid)
         for number, move in enumerate(moves)
     )
+
+
+def open_moves(plan: Plan, made: Made) -> Iterator[tuple[int, Move]]:
+    """Yield the moves that may be made next, with their numbers."""
+    for number, move in enumerate(plan):
+        if number not in made and move.after <= made.keys():
+            yield number, move
+
+
+def stones_left(move: Move, made: Made) -> frozenset[int]:
+    """Return the stones that may still make a move."""
+    return move.stones if len(move.stones) == 1 else move.stones - {stone for stone, _ in made.values()}
+
+
+def places_left(move: Move, made: Made) -> frozenset[Place]:
+    """Return the places of a move that no stone has been put on yet."""
+    return move.places - {place for _, place in made.values() if place != TRAY}
 
 
 def place_name(xy: np.ndarray) -> str:

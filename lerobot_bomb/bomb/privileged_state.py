@@ -41,6 +41,11 @@ class PrivilegedState:
     pending_motion_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
     pending_gripper: float = 0.0
 
+    @property
+    def stone_half_height_m(self) -> float:
+        """Half the height of a stone: a goal is a stone at rest on board or tray, which are equally high."""
+        return float(self.goals[0].xyz[2]) - BOARD.thickness_m
+
     @staticmethod
     def dim(num_goals: int) -> int:
         """Length of the vector with this number of goals."""

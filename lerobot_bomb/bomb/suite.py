@@ -3,14 +3,11 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from lerobot_bomb.bomb.board import COLORS, Intersection
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_move
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.move import Aim, Plan
-from lerobot_bomb.bomb.privileged_state import Goal
 from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.bomb.suites import OWN_SUITES, SUITES
 from lerobot_bomb.conditions import ALL
@@ -66,21 +63,6 @@ class Episode:
         if self.target is not None and self.color is not None:
             return is_legal_move(dict(stones), self.target, self.color) and self.is_clear(stones)
         return self.is_clear(stones)
-
-    @property
-    def stone(self) -> int:
-        """Index of the stone that is moved first."""
-        return self.aims[0].stone
-
-    def goals_after(self, num_moves: int) -> tuple[Goal, ...]:
-        """Return the expert's goals after this number of moves, as far as instructions have named them.
-
-        There are always `Suite.num_goals`: the last one is repeated if need be.
-        """
-        aims = self.aims[: num_moves + 1] if len(self.turns) > 1 else self.aims
-        height_m = self.layout.rest_height_m
-        goals = tuple(Goal(np.array([*aim.xy, height_m]), aim.stone, aim.is_slid) for aim in aims)
-        return goals + goals[-1:] * (find_suite(self.spec.suite).num_goals - len(goals))
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ def _between_fingers(state: PrivilegedState) -> int | None:
     offsets = state.stone_xyz - state.gripper_xyz
     beside_m = np.where(state.stone_in_play, np.linalg.norm(offsets[:, :2], axis=1), np.inf)
     stone = int(beside_m.argmin())
-    is_around = beside_m[stone] < state.stone_radius_m and offsets[stone, 2] > -BOARD.stone_height_m / 2
+    is_around = beside_m[stone] < state.stone_radius_m and offsets[stone, 2] > -state.stone_half_height_m
     return stone if is_around else None
 
 

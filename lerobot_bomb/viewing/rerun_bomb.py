@@ -120,9 +120,7 @@ class BombLog(EpisodeLog[EpisodeSpec, EpisodeResult]):
     def _log_scene(self, state: PrivilegedState) -> None:
         in_play = state.stone_in_play
         colors = [STONE_RGB[COLORS[int(is_white)]] for is_white in state.stone_is_white[in_play]]
-        # a stone's goal is to lie on the board
-        half_height_m = float(state.goals[0].xyz[2]) - BOARD.thickness_m
-        half_size = (state.stone_radius_m, state.stone_radius_m, half_height_m)
+        half_size = (state.stone_radius_m, state.stone_radius_m, state.stone_half_height_m)
         stones = rr.Ellipsoids3D(
             centers=state.stone_xyz[in_play],
             half_sizes=[half_size] * len(colors),
