@@ -15,9 +15,10 @@ from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from lerobot_bomb.actions.ensemble import TemporalEnsemble
-from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims
+from lerobot_bomb.actions.relative import RelativeActions, Statistics, bounds, named_dims
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, frozen_buffers
+from lerobot_bomb.checkpoints.folder import saved_statistics
 from lerobot_bomb.checkpoints.starting import check_start
 from lerobot_bomb.compat.hooks.evaluation import run_tasks_in_turn
 from lerobot_bomb.data.columns import (
@@ -72,7 +73,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self._action_names: list[str] | None = None
         if dataset_meta is not None:
             check_chunk_length(config.chunk_size, dataset_meta)
-            self._take_units(dataset_meta)
+            self._take_units(dataset_meta, _action_statistics(dataset_meta))
         # for all that is random in training
         self.generator = torch.Generator().manual_seed(torch.initial_seed())
         self._base_buffers: dict[str, Tensor] | None = None  # of the checkpoint, before it was fitted to data
@@ -95,7 +96,11 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         )
         if dataset_meta is not None:
             policy._base_buffers = frozen_buffers(policy)
-            policy._fit(dataset_meta)
+            if policy.config.keep_statistics:
+                policy._start_on(dataset_meta, saved_statistics(policy.config)[ACTION])
+            else:
+                policy._start_on(dataset_meta, _action_statistics(dataset_meta))
+                policy._fit(dataset_meta)
         return policy
 
     @classmethod
@@ -106,16 +111,21 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         else:
             check_weights_fit(config, cls.shapes)
 
-    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
-        """Take the dataset's facts that a checkpoint keeps."""
+    def _start_on(self, meta: LeRobotDatasetMetadata, actions: Statistics) -> None:
+        """Check a checkpoint's new dataset, and take what training needs and no checkpoint keeps.
+
+        ``actions``: statistics that the processors normalise actions by, the checkpoint's or the dataset's.
+        """
         check_chunk_length(self.config.chunk_size, meta)
-        self._take_units(meta)
+        self._take_units(meta, actions)
+
+    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+        """Fit to a dataset and its statistics what a checkpoint keeps."""
 
     @torch.no_grad()
-    def _take_units(self, meta: LeRobotDatasetMetadata) -> None:
-        assert meta.stats is not None
+    def _take_units(self, meta: LeRobotDatasetMetadata, actions: Statistics) -> None:
         mode = self.config.normalization_mapping["ACTION"]
-        low, high = bounds(meta.stats[ACTION], mode, self.action_dim)
+        low, high = bounds(actions, mode, self.action_dim)
         self.action_unit.copy_(torch.from_numpy(high - low) / 2)
         self._action_names = dim_names(meta.features[ACTION])
 
@@ -436,6 +446,11 @@ class TokenVlaPolicy(VlaPolicy):
             return None
         noise = self._sampling_noise.draw(batch_size, shape)
         return self.config.temperature * noise.to(self._device)
+
+
+def _action_statistics(meta: LeRobotDatasetMetadata) -> Statistics:
+    assert meta.stats is not None
+    return meta.stats[ACTION]
 
 
 def _take_action_names(config: Any, meta: LeRobotDatasetMetadata | None) -> None:

@@ -18,6 +18,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_bomb.actions.accuracy import means
+from lerobot_bomb.actions.relative import Statistics
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.checkpoints.adapters import peft_targets
@@ -93,10 +94,15 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         assert self.config.robot_state_feature is not None
         return nn.Linear(self.config.robot_state_feature.shape[0], hidden_size)
 
+    def _start_on(self, meta: LeRobotDatasetMetadata, actions: Statistics) -> None:
+        super()._start_on(meta, actions)
+        if self.pointer is not None:
+            self.config.take_places(meta)
+
     def _fit(self, meta: LeRobotDatasetMetadata) -> None:
         super()._fit(meta)
         if self.pointer is not None:
-            self.pointer.fit(meta, self.config)
+            self.pointer.fit_units(meta, self.config.normalization_mapping)
 
     @property
     def parameter_counts(self) -> dict[str, int]:

@@ -118,11 +118,6 @@ class Pointer(DataUnits):
             "held_loss": binary_cross_entropy_with_logits(pointed.held_logit, labels.held, reduction="none"),
         }
 
-    def fit(self, meta: LeRobotDatasetMetadata, config: FdvlaConfig) -> None:
-        """Take the normalisation from a dataset, and check that the config has its places."""
-        config.take_places(meta)
-        self.fit_units(meta, config.normalization_mapping)
-
     def draw_labels(
         self, batch: dict[str, Tensor], config: FdvlaConfig, generator: torch.Generator
     ) -> Labels:
@@ -145,7 +140,7 @@ def make_pointer(
     assert config.action_feature is not None
     pointer = Pointer(hidden_size, config.action_feature.shape[0], places)
     if meta is not None:
-        pointer.fit(meta, config)
+        pointer.fit_units(meta, config.normalization_mapping)
     return pointer
 
 

@@ -22,6 +22,7 @@ from lerobot_bomb.actions.bins import Bins
 from lerobot_bomb.actions.grid_report import edges_text
 from lerobot_bomb.actions.grid_rows import interpolate_rows
 from lerobot_bomb.actions.grids import ActionGrids
+from lerobot_bomb.actions.relative import Statistics
 from lerobot_bomb.actions.text import TokenRows, digits_needed, number_symbols
 from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.checkpoints.adapters import peft_targets
@@ -125,7 +126,8 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         """Prepare as other policies do; grids are as they were, or adapt to the new data."""
         complete_depth(config, meta)
         config.check_template_as_trained()
-        config.check_grid_as_trained(is_refitted=meta is not None and config.adapt_embeddings)
+        is_refitted = meta is not None and config.adapt_embeddings and not config.keep_statistics
+        config.check_grid_as_trained(is_refitted=is_refitted)
         super()._prepare(config, meta)
 
     @classmethod
@@ -138,13 +140,16 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
             model.may_lack = (*model.may_lack, "zoedepth")
         return super()._load_as_safetensor(model, model_file, map_location, strict)
 
-    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+    def _start_on(self, meta: LeRobotDatasetMetadata, actions: Statistics) -> None:
+        super()._start_on(meta, actions)
         if self.pointer is not None:
             self.config.take_places(meta)
-            self.pointer.fit(meta, self.config)
+            self.pointer.fit(actions, self.config.normalization_mapping["ACTION"])
+
+    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+        super()._fit(meta)
         if self.config.adapt_embeddings:
             self._adapt(meta)
-        super()._fit(meta)
 
     @torch.no_grad()
     def _init_cells(self) -> None:

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from lerobot.configs import NormalizationMode
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
+from lerobot_bomb.actions.relative import Statistics, bounds
 from lerobot_bomb.bomb.pointing import PointedAt
-from lerobot_bomb.policies.pointing import Labels, normalised_actions, unit_bounds
+from lerobot_bomb.policies.pointing import Labels, normalised_actions
 
 if TYPE_CHECKING:
     from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import SpatialvlaGridConfig
@@ -117,9 +119,10 @@ class CellPointer(nn.Module):
         )
 
     @torch.no_grad()
-    def fit(self, meta: LeRobotDatasetMetadata, config: "SpatialvlaGridConfig") -> None:
-        """Take the normalisation of actions from a dataset."""
-        self.action_bounds.copy_(unit_bounds(meta, ACTION, config.normalization_mapping["ACTION"]))
+    def fit(self, actions: Statistics, mode: NormalizationMode) -> None:
+        """Take the normalisation of actions from their statistics."""
+        low_D, high_D = bounds(actions, mode, self.action_bounds.shape[1])
+        self.action_bounds.copy_(torch.from_numpy(np.stack([low_D, high_D])))
 
     def draw(
         self, batch: dict[str, Any], config: "SpatialvlaGridConfig", generator: torch.Generator
@@ -146,5 +149,6 @@ def make_pointer(config: "SpatialvlaGridConfig", meta: LeRobotDatasetMetadata | 
     assert config.action_feature is not None
     pointer = CellPointer(config.take_places(meta), config.stone_cells(), config.action_feature.shape[0])
     if meta is not None:
-        pointer.fit(meta, config)
+        assert meta.stats is not None
+        pointer.fit(meta.stats[ACTION], config.normalization_mapping["ACTION"])
     return pointer

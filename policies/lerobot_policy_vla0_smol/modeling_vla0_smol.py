@@ -17,6 +17,7 @@ from torch.nn.functional import cross_entropy, pad
 
 from lerobot_bomb.actions.accuracy import counted_numbers, exact_numbers, means, read_numbers
 from lerobot_bomb.actions.bins import Bins
+from lerobot_bomb.actions.relative import Statistics
 from lerobot_bomb.actions.text import (
     END,
     IGNORED,
@@ -102,10 +103,15 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         self._decoded: Decoded | None = None  # in the last prediction
         self.reset()
 
+    def _start_on(self, meta: LeRobotDatasetMetadata, actions: Statistics) -> None:
+        super()._start_on(meta, actions)
+        if self.pointer is not None:
+            self.pointer.check(meta, self.config)
+
     def _fit(self, meta: LeRobotDatasetMetadata) -> None:
         super()._fit(meta)
         if self.pointer is not None:
-            self.pointer.fit(meta, self.config)
+            self.pointer.fit_units(meta, self.config.normalization_mapping)
 
     def _num_numbers(self, num_steps: int) -> int:
         """Count the numbers of an answer with this many actions."""
