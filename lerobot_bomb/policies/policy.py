@@ -136,6 +136,10 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
         self._batch_size: int | None = None  # of the episodes that are under way
 
+    def reset_to(self, first_episode: int) -> None:
+        """Reset, to act as in a batch that begins with this episode of an evaluation."""
+        self.reset()
+
     def drop_queued_actions(self) -> None:
         """Let the next `select_action` predict; LeRobot 0.6.2 calls this when the instruction changes."""
         self._queue.clear()
@@ -426,6 +430,10 @@ class TokenVlaPolicy(VlaPolicy):
     def reset(self) -> None:
         super().reset()
         self._sampling_noise.begin()
+
+    def reset_to(self, first_episode: int) -> None:
+        super().reset_to(first_episode)
+        self._sampling_noise.begin(first_episode)
 
     def predict_action_chunk(
         self,

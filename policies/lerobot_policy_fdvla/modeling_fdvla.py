@@ -121,6 +121,10 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         super().reset()
         self._sampling_noise.begin()
 
+    def reset_to(self, first_episode: int) -> None:
+        super().reset_to(first_episode)
+        self._sampling_noise.begin(first_episode)
+
     # Training
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
