@@ -92,10 +92,10 @@ def test_labels_are_of_training_only() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_heads_are_given_the_place_that_is_meant_or_another_with_its_action(share: float) -> None:
-    policy = pointing_policy(counterfactual_share=share)
+    policy = pointing_policy()
     assert policy.pointer is not None
     batch = pointing_batch(policy)
-    labels = policy.pointer.draw_labels(batch, policy.config, torch.Generator().manual_seed(0))
+    labels = policy.pointer.labels(batch, share, "fdvla", torch.Generator().manual_seed(0))
     assert labels.place.tolist() == [0, 1, 2, 3]
     assert labels.is_other.tolist() == 4 * [share == 1]
     actions_BKD, loss_mask_BK = labels.given_actions(
@@ -112,10 +112,10 @@ def test_heads_are_given_the_place_that_is_meant_or_another_with_its_action(shar
 
 
 def test_of_a_chunk_only_the_next_action_is_known_for_another_place() -> None:
-    policy = pointing_policy(counterfactual_share=1.0, chunk_size=4)
+    policy = pointing_policy(chunk_size=4)
     assert policy.pointer is not None
     batch = pointing_batch(policy)
-    labels = policy.pointer.draw_labels(batch, policy.config, torch.Generator().manual_seed(0))
+    labels = policy.pointer.labels(batch, 1.0, "fdvla", torch.Generator().manual_seed(0))
     actions_BKD, loss_mask_BK = labels.given_actions(
         batch["action"], torch.ones(4, 4).bool(), labels.other_actions[:, None]
     )
@@ -295,9 +295,9 @@ def test_a_context_is_its_tensors() -> None:
 
 
 def test_other_actions_are_normalised_as_the_datasets() -> None:
-    policy = pointing_policy(counterfactual_share=1.0)
+    policy = pointing_policy()
     assert policy.pointer is not None
     policy.pointer.action_bounds.copy_(torch.tensor([[0.0, 0.0, 0.0, -1.0], [2.0, 1.0, 1.0, 1.0]]))
     batch = pointing_batch(policy) | {OTHER_ACTIONS: torch.tensor(4 * [2 * [2.0, 0.5, 0.0, 1.0]])}
-    labels = policy.pointer.draw_labels(batch, policy.config, torch.Generator())
+    labels = policy.pointer.labels(batch, 1.0, "fdvla", torch.Generator())
     torch.testing.assert_close(labels.other_actions, torch.tensor(4 * [[1.0, 0.0, -1.0, 1.0]]))

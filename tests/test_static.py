@@ -221,7 +221,7 @@ def test_a_policy_points_as_recorded(recorded: dict[str, Path], tmp_path: Path) 
     torch.testing.assert_close(batch["observation.pointing.place"], raw["observation.pointing.place"])
     pointed = policy._point(policy._read(batch), batch["observation.state"])
     torch.testing.assert_close(pointed.gripper, raw["observation.state"][:, :3], atol=1e-5, rtol=0)
-    labels = policy.pointer.draw_labels(batch, policy.config, torch.Generator().manual_seed(0))
+    labels = policy.pointer.labels(batch, 1.0, "fdvla", torch.Generator().manual_seed(0))
     torch.testing.assert_close(
         policy.pointer.places[labels.place], raw["observation.pointing.place"], atol=1e-5, rtol=0
     )

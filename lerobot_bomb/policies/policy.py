@@ -36,6 +36,7 @@ from lerobot_bomb.policies.config import ChunkConfig, TokenVlaConfig, VlaConfig
 from lerobot_bomb.policies.relative_config import RelativeVlaConfig
 from lerobot_bomb.training.distributed import SavesTiedWeightsOnce
 from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_fit, trained_with
+from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.inputs import read_state, read_task, read_tensor
 from lerobot_bomb.vlm.layout import INSTRUCTION, PromptLayout
 from lerobot_bomb.vlm.prompt import task_ids, task_text
@@ -153,6 +154,13 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
                 f"under way; call policy.reset() where episodes begin"
             )
         self._batch_size = batch_size
+
+    def _begin_batch(self) -> None:
+        """Seed all that is random in `forward`: each batch of a training anew, all of an evaluation alike."""
+        if self.training:
+            begin_batch(self.config, self.generator)
+        elif not torch.is_grad_enabled():  # a loop of one's own may learn in evaluation mode
+            self.generator.manual_seed(torch.initial_seed())  # which may be set for each frame
 
     def _loss_mask(self, batch: dict[str, Tensor]) -> Tensor:
         """Return (B, T) bool, the actions that the loss counts; of a static scene only the first."""

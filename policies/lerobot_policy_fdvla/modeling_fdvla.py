@@ -34,7 +34,6 @@ from lerobot_bomb.policies.pointing import Labels
 from lerobot_bomb.policies.pointing_policy import BOARD_READER, Parts, PointingVlaPolicy, plus
 from lerobot_bomb.policies.policy import RelativeVlaPolicy
 from lerobot_bomb.training.distributed import weighed
-from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.images import crop, encode_images
 from lerobot_bomb.vlm.inputs import read_actions, read_image
 from lerobot_bomb.vlm.layout import INSTRUCTION, STATE
@@ -132,8 +131,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
 
         A chunk gets ``draws_per_chunk`` times, as in CogACT (arXiv 2411.19650); `B` then counts them all.
         """
-        if self.training:
-            begin_batch(self.config, self.generator)
+        self._begin_batch()
         draws = self.config.draws_per_chunk
         actions_BKD, loss_mask_BK, labels = self._targets(batch)
         actions_BKD, loss_mask_BK = (
@@ -193,7 +191,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         actions_BKD, loss_mask_BK = self._actions(batch), self._loss_mask(batch)
         if self.pointer is None:
             return actions_BKD, loss_mask_BK, None
-        labels = self.pointer.draw_labels(batch, self.config, self.generator)
+        labels = self.pointer.labels(batch, self._other_share, self.config.type, self.generator)
         other_B1D = self.to_relative(labels.other_actions[:, None], batch)
         return *labels.given_actions(actions_BKD, loss_mask_BK, other_B1D), labels
 

@@ -6,6 +6,7 @@ Shapes: `B` batch, `P` places, `S` spots where stones lie, `H` hidden size, `D` 
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -118,11 +119,11 @@ class Pointer(DataUnits):
             "held_loss": binary_cross_entropy_with_logits(pointed.held_logit, labels.held, reduction="none"),
         }
 
-    def draw_labels(
-        self, batch: dict[str, Tensor], config: FdvlaConfig, generator: torch.Generator
+    def labels(
+        self, batch: dict[str, Any], other_share: float, policy_type: str, generator: torch.Generator
     ) -> Labels:
         """Read a batch's labels and draw the given places; actions are as LeRobot normalises them."""
-        labels = Labels.draw(batch, self.places, config.counterfactual_share, config.type, generator)
+        labels = Labels.draw(batch, self.places, other_share, policy_type, generator)
         return replace(labels, other_actions=self.normalised(labels.other_actions))
 
 

@@ -33,7 +33,6 @@ from lerobot_bomb.decoding.slots import SlotDecoder
 from lerobot_bomb.policies.pointing_policy import BOARD_READER, PointingVlaPolicy
 from lerobot_bomb.policies.policy import TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
-from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.depth import load_zoedepth
 from lerobot_bomb.vlm.ego3d import Ego3D
 from lerobot_bomb.vlm.images import draw_windows, resized_pixels
@@ -210,8 +209,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         """Return the answer's cross-entropy over the loss mask; ``reduction="none"`` gives (B,)."""
         if reduction not in ("mean", "none"):
             raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
-        if self.training:
-            begin_batch(self.config, self.generator)
+        self._begin_batch()
         cells_BTG, loss_mask_BT, pointed = self._targets(batch)
         with self.autocast():
             pointing_BNH, hidden_BTGH, features_BPH = self._hidden(batch, cells_BTG, pointed.tokens)
@@ -240,7 +238,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
                 loss_mask_BT,
                 Target.nothing(len(loss_mask_BT), self._device),
             )
-        labels, pointed = self.pointer.draw(batch, self.config, self.generator)
+        labels, pointed = self.pointer.labels(batch, self._other_share, self.config.type, self.generator)
         actions_BTD, loss_mask_BT = labels.given_actions(
             actions_BTD, loss_mask_BT, labels.other_actions[:, None]
         )

@@ -124,14 +124,14 @@ class CellPointer(nn.Module):
         low_D, high_D = bounds(actions, mode, self.action_bounds.shape[1])
         self.action_bounds.copy_(torch.from_numpy(np.stack([low_D, high_D])))
 
-    def draw(
-        self, batch: dict[str, Any], config: "SpatialvlaGridConfig", generator: torch.Generator
+    def labels(
+        self, batch: dict[str, Any], other_share: float, policy_type: str, generator: torch.Generator
     ) -> tuple[Labels, Target]:
-        """Draw a batch's labels, actions as LeRobot normalises them, and the tokens that are given.
+        """Read a batch's labels, actions as LeRobot normalises them, and draw the tokens that are given.
 
         Counterfactual places carry no loss.
         """
-        labels = Labels.draw(batch, self.places, config.counterfactual_share, config.type, generator)
+        labels = Labels.draw(batch, self.places, other_share, policy_type, generator)
         tokens_B2 = torch.stack([labels.given, self.stones.number_of(labels.stone_xy)], dim=1)
         loss_mask_B2 = torch.stack([~labels.is_other, torch.ones_like(labels.is_other)], dim=1)
         others_BD = normalised_actions(labels.other_actions, self.action_bounds)

@@ -40,7 +40,6 @@ from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.policies.pointing_policy import BOARD_READER, Parts, PointingVlaPolicy
 from lerobot_bomb.policies.policy import RelativeVlaPolicy, TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
-from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.color_jitter import ColorJitter
 from lerobot_bomb.vlm.images import crop, encode_images
 from lerobot_bomb.vlm.inputs import read_actions, read_image
@@ -130,8 +129,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         """Return the answer's cross-entropy over the loss mask; ``reduction="none"`` gives (B,)."""
         if reduction not in ("mean", "none"):
             raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
-        if self.training:
-            begin_batch(self.config, self.generator)
+        self._begin_batch()
         with self.autocast():
             prompt = self.prompt(batch)
             bins_BN, loss_mask_BN = self._targets(batch)
@@ -220,10 +218,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         actions_BTD, loss_mask_BT = self.to_relative(actions_BTD, batch), self._loss_mask(batch)
         if self.pointer is None:
             return self._action_targets(actions_BTD, loss_mask_BT)
-        config = self.config
-        # evaluation is on the true places
-        share = config.counterfactual_share if self.training else 0.0
-        labels = self.pointer.labels(batch, share, config.type, self.generator)
+        labels = self.pointer.labels(batch, self._other_share, self.config.type, self.generator)
         other_B1D = self.to_relative(labels.other_actions[:, None], batch)
         targets = self._action_targets(*labels.given_actions(actions_BTD, loss_mask_BT, other_B1D))
         pointing = self.pointer.bins_of(labels, self._state(batch)), self.pointer.loss_mask(labels)
