@@ -171,8 +171,9 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         loss_mask_BT = torch.ones_like(is_pad_BT) if self.config.loss_on_padded_actions else ~is_pad_BT
         if isinstance(done_B1 := batch.get(DONE), Tensor):
             is_later_T = torch.arange(shape[1], device=self._device) > 0
-            # actions after a done frame that are no padding belong to the next scene
-            loss_mask_BT = loss_mask_BT & ~(done_B1.reshape(-1, 1).bool() & is_later_T & ~is_pad_BT)
+            # what follows a done frame belongs to the next scene, and so does padding beyond that
+            has_next_B1 = done_B1.reshape(-1, 1).bool() & ~is_pad_BT[:, :2][:, -1:]
+            loss_mask_BT = loss_mask_BT & ~(has_next_B1 & is_later_T)
         return loss_mask_BT
 
     def _l1_parts(self, errors_BTD: Tensor, counted_BTD: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
