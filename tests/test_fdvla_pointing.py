@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 from fdvla_cases import WORKSPACE, make_batch, make_config, make_policy
+from lerobot.configs import NormalizationMode
+from lerobot.policies.factory import make_pre_post_processors
 from torch import Tensor, nn
 
 from lerobot_bomb.bomb.pointing import SPOTS_XY_M
@@ -168,7 +170,7 @@ def test_the_loss_of_each_row_adds_up_to_the_mean() -> None:
 
 
 def test_numbers_are_ways_in_metres_at_three_scales() -> None:
-    pointer = Pointer(8, 4, PLACES)
+    pointer = Pointer(8, 4, PLACES, NormalizationMode.MEAN_STD)
     pointed = Pointed(
         gripper=torch.tensor([[0.03, 0.0, 0.05]]),
         place_logits=torch.zeros(1, 4),
@@ -185,7 +187,7 @@ def test_numbers_are_ways_in_metres_at_three_scales() -> None:
 
 
 def test_the_gripper_is_read_in_metres() -> None:
-    pointer = Pointer(8, 4, PLACES)
+    pointer = Pointer(8, 4, PLACES, NormalizationMode.MEAN_STD)
     pointer.gripper_dims.copy_(torch.tensor([1, 2, 3]))
     pointer.state_bounds.copy_(torch.tensor([[0.0, -0.1, 0.0], [0.2, 0.1, 0.1]]))
     pointed = pointer(torch.zeros(1, 8), torch.tensor([[9.0, 0.0, 1.0, -1.0]]))
@@ -301,3 +303,19 @@ def test_other_actions_are_normalised_as_the_datasets() -> None:
     batch = pointing_batch(policy) | {OTHER_ACTIONS: torch.tensor(4 * [2 * [2.0, 0.5, 0.0, 1.0]])}
     labels = policy.pointer.labels(batch, 1.0, "fdvla", torch.Generator())
     torch.testing.assert_close(labels.other_actions, torch.tensor(4 * [[1.0, 0.0, -1.0, 1.0]]))
+
+
+@pytest.mark.parametrize("mode", [NormalizationMode.MEAN_STD, NormalizationMode.MIN_MAX])
+def test_an_action_that_never_changes_is_lerobots(mode: NormalizationMode) -> None:
+    policy = pointing_policy(
+        normalization_mapping=dict.fromkeys(("STATE", "ACTION"), mode)
+        | {"VISUAL": NormalizationMode.IDENTITY}
+    )
+    low, high = torch.tensor([[-1.0, -2.0, 0.5, 1.0], [1.0, 2.0, 0.5, 1.0]])
+    statistics = {"mean": (low + high) / 2, "std": (high - low) / 2, "min": low, "max": high}
+    prepare, _ = make_pre_post_processors(policy.config, dataset_stats={"action": statistics})
+    action = torch.tensor([[0.3, -1.0, 0.5, 1.0]])
+    assert policy.pointer is not None
+    policy.pointer.action_bounds.copy_(torch.stack([low, high]))
+    expected = prepare({"observation.state": torch.zeros(1, 4), "action": action, "task": ["go"]})["action"]
+    torch.testing.assert_close(policy.pointer.normalised(action), expected)

@@ -114,7 +114,8 @@ def test_units_are_those_of_the_processors(
     assert actions.equal(expected) == keeps
 
     # labels, metrics and relative actions are in the units of the batch, whoever's those are
-    labels = normalised_actions(raw["action"], new.pointer.action_bounds)
+    mode = new.config.normalization_mapping["ACTION"]
+    labels = normalised_actions(raw["action"], new.pointer.action_bounds, mode)
     torch.testing.assert_close(labels, batch["action"], atol=1e-5, rtol=0)
     (one, other), (one_raw, other_raw) = batch["action"], raw["action"]
     torch.testing.assert_close((one - other) * new.action_unit, one_raw - other_raw, atol=1e-5, rtol=0)

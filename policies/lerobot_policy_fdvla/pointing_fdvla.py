@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from lerobot.configs import NormalizationMode
 from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
@@ -44,8 +45,14 @@ class Pointer(DataUnits):
     places: Tensor  # (P, 2) metres
     spots: Tensor  # (S, 2) metres
 
-    def __init__(self, hidden_size: int, action_dim: int, places: list[list[float]]):
-        super().__init__(action_dim)
+    def __init__(
+        self,
+        hidden_size: int,
+        action_dim: int,
+        places: list[list[float]],
+        action_mode: NormalizationMode,
+    ):
+        super().__init__(action_dim, action_mode)
         self.register_buffer("places", torch.tensor(places))
         self.features = nn.Sequential(nn.Linear(hidden_size, hidden_size), nn.SiLU())
         self.register_buffer("spots", torch.tensor(SPOTS_XY_M), persistent=False)
@@ -139,7 +146,8 @@ def make_pointer(
         return None
     places = config.take_places(meta)
     assert config.action_feature is not None
-    pointer = Pointer(hidden_size, config.action_feature.shape[0], places)
+    mode = config.normalization_mapping["ACTION"]
+    pointer = Pointer(hidden_size, config.action_feature.shape[0], places, mode)
     if meta is not None:
         pointer.fit_units(meta, config.normalization_mapping)
     return pointer

@@ -34,7 +34,7 @@ class TextPointer(DataUnits):
 
     def __init__(self, config: Vla0SmolConfig):
         assert config.action_feature is not None
-        super().__init__(config.action_feature.shape[0])
+        super().__init__(config.action_feature.shape[0], config.normalization_mapping["ACTION"])
         self._range_m = config.pointing_range_m
         self._bins = Bins(config.n_action_bins, config.bin_mode)
 
