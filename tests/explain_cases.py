@@ -1,6 +1,6 @@
 """The policies that come with the package, asked about one observation of BOMB."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import cache
@@ -33,9 +33,10 @@ GRID = 4
 WORKSPACE, WRIST = "observation.images.workspace", "observation.images.wrist"
 
 
-def fresh(name: str, device: str = "cpu") -> LoadedPolicy:
+def fresh(name: str, device: str = "cpu", flags: Sequence[str] = ()) -> LoadedPolicy:
     """One that a test may change."""
-    return load_policy(Path(checkpoint_path(f"bomb:{name}")), device, "bomb", {"image_size": 64}, seed=0)
+    path = Path(checkpoint_path(f"bomb:{name}"))
+    return load_policy(path, device, "bomb", {"image_size": 64}, seed=0, policy_flags=flags)
 
 
 loaded = cache(fresh)

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from explain_cases import NAMES, WORKSPACE, WRIST, ask, loaded, moment, query, scored_by, without_image
+from explain_cases import NAMES, WORKSPACE, WRIST, ask, fresh, loaded, moment, query, scored_by, without_image
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -93,6 +93,18 @@ def test_the_clean_answer_is_the_policys(name: str) -> None:
     policy.begin()
     again = question.policy.answer(policy.prepare(question.observation))
     assert torch.equal(again, question.answer)
+
+
+@pytest.mark.parametrize(
+    ("name", "flag"), [("fdvla", "noise_per_episode=true"), ("vla0_smol", "temperature=1")]
+)
+def test_an_episode_begins_with_its_own_noise(name: str, flag: str) -> None:
+    policy = fresh(name, flags=[f"--{flag}"])
+    (observation, instruction, *_), actions = moment(), []
+    for number in (0, 0, 1):
+        policy.begin(number)
+        actions.append(policy.agent([observation], [instruction]).tolist())
+    assert actions[0] == actions[1] != actions[2]
 
 
 def corruptions(name: str) -> list[Corruption]:

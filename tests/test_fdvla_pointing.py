@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 from fdvla_cases import WORKSPACE, make_batch, make_config, make_policy
+from lerobot.configs import NormalizationMode
+from lerobot.policies.factory import make_pre_post_processors
 from torch import Tensor, nn
 
 from lerobot_bomb.bomb.pointing import SPOTS_XY_M
@@ -92,10 +94,10 @@ def test_labels_are_of_training_only() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_heads_are_given_the_place_that_is_meant_or_another_with_its_action(share: float) -> None:
-    policy = pointing_policy(counterfactual_share=share)
+    policy = pointing_policy()
     assert policy.pointer is not None
     batch = pointing_batch(policy)
-    labels = policy.pointer.draw_labels(batch, policy.config, torch.Generator().manual_seed(0))
+    labels = policy.pointer.labels(batch, share, "fdvla", torch.Generator().manual_seed(0))
     assert labels.place.tolist() == [0, 1, 2, 3]
     assert labels.is_other.tolist() == 4 * [share == 1]
     actions_BKD, loss_mask_BK = labels.given_actions(
@@ -112,10 +114,10 @@ def test_heads_are_given_the_place_that_is_meant_or_another_with_its_action(shar
 
 
 def test_of_a_chunk_only_the_next_action_is_known_for_another_place() -> None:
-    policy = pointing_policy(counterfactual_share=1.0, chunk_size=4)
+    policy = pointing_policy(chunk_size=4)
     assert policy.pointer is not None
     batch = pointing_batch(policy)
-    labels = policy.pointer.draw_labels(batch, policy.config, torch.Generator().manual_seed(0))
+    labels = policy.pointer.labels(batch, 1.0, "fdvla", torch.Generator().manual_seed(0))
     actions_BKD, loss_mask_BK = labels.given_actions(
         batch["action"], torch.ones(4, 4).bool(), labels.other_actions[:, None]
     )
@@ -168,7 +170,7 @@ def test_the_loss_of_each_row_adds_up_to_the_mean() -> None:
 
 
 def test_numbers_are_ways_in_metres_at_three_scales() -> None:
-    pointer = Pointer(8, 4, PLACES)
+    pointer = Pointer(8, 4, PLACES, NormalizationMode.MEAN_STD)
     pointed = Pointed(
         gripper=torch.tensor([[0.03, 0.0, 0.05]]),
         place_logits=torch.zeros(1, 4),
@@ -185,7 +187,7 @@ def test_numbers_are_ways_in_metres_at_three_scales() -> None:
 
 
 def test_the_gripper_is_read_in_metres() -> None:
-    pointer = Pointer(8, 4, PLACES)
+    pointer = Pointer(8, 4, PLACES, NormalizationMode.MEAN_STD)
     pointer.gripper_dims.copy_(torch.tensor([1, 2, 3]))
     pointer.state_bounds.copy_(torch.tensor([[0.0, -0.1, 0.0], [0.2, 0.1, 0.1]]))
     pointed = pointer(torch.zeros(1, 8), torch.tensor([[9.0, 0.0, 1.0, -1.0]]))
@@ -295,9 +297,25 @@ def test_a_context_is_its_tensors() -> None:
 
 
 def test_other_actions_are_normalised_as_the_datasets() -> None:
-    policy = pointing_policy(counterfactual_share=1.0)
+    policy = pointing_policy()
     assert policy.pointer is not None
     policy.pointer.action_bounds.copy_(torch.tensor([[0.0, 0.0, 0.0, -1.0], [2.0, 1.0, 1.0, 1.0]]))
     batch = pointing_batch(policy) | {OTHER_ACTIONS: torch.tensor(4 * [2 * [2.0, 0.5, 0.0, 1.0]])}
-    labels = policy.pointer.draw_labels(batch, policy.config, torch.Generator())
+    labels = policy.pointer.labels(batch, 1.0, "fdvla", torch.Generator())
     torch.testing.assert_close(labels.other_actions, torch.tensor(4 * [[1.0, 0.0, -1.0, 1.0]]))
+
+
+@pytest.mark.parametrize("mode", [NormalizationMode.MEAN_STD, NormalizationMode.MIN_MAX])
+def test_an_action_that_never_changes_is_lerobots(mode: NormalizationMode) -> None:
+    policy = pointing_policy(
+        normalization_mapping=dict.fromkeys(("STATE", "ACTION"), mode)
+        | {"VISUAL": NormalizationMode.IDENTITY}
+    )
+    low, high = torch.tensor([[-1.0, -2.0, 0.5, 1.0], [1.0, 2.0, 0.5, 1.0]])
+    statistics = {"mean": (low + high) / 2, "std": (high - low) / 2, "min": low, "max": high}
+    prepare, _ = make_pre_post_processors(policy.config, dataset_stats={"action": statistics})
+    action = torch.tensor([[0.3, -1.0, 0.5, 1.0]])
+    assert policy.pointer is not None
+    policy.pointer.action_bounds.copy_(torch.stack([low, high]))
+    expected = prepare({"observation.state": torch.zeros(1, 4), "action": action, "task": ["go"]})["action"]
+    torch.testing.assert_close(policy.pointer.normalised(action), expected)

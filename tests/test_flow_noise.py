@@ -57,3 +57,11 @@ def test_noise_is_standard_normal_and_independent(is_per_episode: bool) -> None:
     pairs = [(first[0], second[0])] + ([(first[0], first[1])] if is_per_episode else [])
     for one, other in pairs:
         assert (one * other).mean().item() == pytest.approx(0, abs=0.03)
+
+
+def test_an_episodes_noise_can_be_drawn_again() -> None:
+    noise = SamplingNoise(1, is_per_episode=True)
+    first, *_, fifth = draws(noise, [2, 3])
+    for episode, expected in ((4, fifth), (0, first)):
+        noise.begin(episode)
+        assert torch.cat([noise.draw(1, SHAPE), noise.draw(1, SHAPE)]).equal(expected)

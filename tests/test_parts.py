@@ -43,7 +43,7 @@ def go_down(observation: dict[str, Any], instruction: str) -> np.ndarray:
 
 EXPERT = EpisodeSource()
 HALF = EpisodeSource(expert=misplace_white)
-OTHER = EpisodeSource(behavior=BehaviorPolicy(lambda: None, go_down))
+OTHER = EpisodeSource(behavior=BehaviorPolicy(lambda number: None, go_down))
 
 
 def contents(root: Path) -> dict[str, bytes]:

@@ -1,5 +1,6 @@
 """`record --relabel`: a policy acts, the expert says what it would have done."""
 
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.pointing import colors_on_spots
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands.main import main
+from lerobot_bomb.data.recorded_blocks import BehaviorPolicy, EpisodeSource
+from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.envs.rollout import make_env
 
 HERE = Environment("scara", "relative", 10, 64, ("workspace", "wrist"), "1.0", "place")
@@ -52,6 +55,16 @@ def test_what_the_policy_sees_gets_the_experts_actions(checkpoint: Path, tmp_pat
     states = np.stack([np.asarray(dataset[i]["observation.state"]) for i in (0, 40, 99)])
     assert abs(np.diff(states[:, :3], axis=0)).max() > 0.01  # it moved, and not as the expert
     env.close()
+
+
+def test_episodes_begin_with_their_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lerobot_bomb.data.rollout_pool._Worker.rollout", lambda _, spec: spec)
+    begun: list[int] = []
+    source = EpisodeSource(behavior=BehaviorPolicy(begun.append, lambda *_: np.zeros(4)))
+    pool = source.rollouts(Recording("test/own", episodes=10, relabel="weights"), num_tried=6)
+    for _ in range(2):  # blocks
+        assert len(list(islice(pool, 2))) == 2
+    assert begun == [6, 7, 8, 9]
 
 
 def test_a_policy_of_another_environment_is_refused(

@@ -23,22 +23,22 @@ FLAGS = ("--policy.num_inference_steps=3",)
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
-    """The file of results of an evaluation by lerobot-eval, in which two episodes are a batch."""
+    """The file of results of two episodes by lerobot-eval, which are a batch unless said otherwise."""
     from lerobot_bomb.sweep.manifest import plan
     from lerobot_bomb.sweep.store import Store
     from lerobot_bomb.sweep.worker import Worker
 
     files: dict[Any, Path] = {}
 
-    def evaluated(policy: str, *flags: str, condition: str = "all:1-5") -> Path:
-        if (policy, flags, condition) not in files:
+    def evaluated(policy: str, *flags: str, condition: str = "all:1-5", batch_size: int = 2) -> Path:
+        if (policy, flags, condition, batch_size) not in files:
             folder = tmp_path_factory.mktemp("sweep")
             shown = ("--env.type=bomb", "--env.image_size=64", "--policy.device=cpu", *flags)
-            store = Store(folder, plan((policy,), (), (condition,), 7, 2, 2, shown))
+            store = Store(folder, plan((policy,), (), (condition,), 7, 2, batch_size, shown))
             Worker(store).run(list(store.manifest.jobs))
             store.merge()
-            files[policy, flags, condition] = folder / "results.jsonl"
-        return files[policy, flags, condition]
+            files[policy, flags, condition, batch_size] = folder / "results.jsonl"
+        return files[policy, flags, condition, batch_size]
 
     return evaluated
 
@@ -77,6 +77,15 @@ def test_a_record_is_run_again_bit_for_bit(
         output = f"--output={tmp_path / str(line)}"
         assert main(["replay", str(path), f"--line={line}", output, *of_policy]) == 0
         assert "as recorded, bit for bit: spec, is_success, failure, " in capsys.readouterr().out
+
+
+def test_a_later_batch_draws_its_own_noise_again(
+    results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = (*FLAGS, "--policy.noise_per_episode=true")
+    path = results("bomb:fdvla", *flags, condition=NONE, batch_size=1)
+    assert main(["replay", str(path), "--line=2", f"--output={tmp_path / 'second'}", *flags]) == 0
+    assert "as recorded, bit for bit" in capsys.readouterr().out
 
 
 def test_flags_of_the_evaluation_are_given_again(

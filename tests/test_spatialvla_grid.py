@@ -179,6 +179,25 @@ def test_depth_changes_nothing_before_training_and_something_after() -> None:
     assert not torch.isclose(policy(with_depth(policy, dict(batch), seed=1))[0], trained, rtol=1e-6)
 
 
+def test_depth_stays_in_metres(tmp_path: Path) -> None:
+    """LeRobot has statistics of each column of floats, in new processors and in those of a checkpoint."""
+    policy = make_policy(depth_source="observation")
+    depth = {f"observation.depth.{name}": torch.full((1, SIZE, SIZE), 0.8) for name in ("workspace", "wrist")}
+    of_depth = {"min": torch.full((1, 1, 1), 0.1), "max": torch.full((1, 1, 1), 1.5)}
+    statistics = stats() | dict.fromkeys(depth, of_depth)
+    processors = make_pre_post_processors(policy.config, dataset_stats=statistics)
+    for part in (policy, *processors):
+        part.save_pretrained(tmp_path)
+    config: Any = PreTrainedConfig.from_pretrained(tmp_path)
+    loaded = SpatialvlaGridPolicy.from_pretrained(tmp_path, config=config)
+    overrides = {"normalizer_processor": {"stats": statistics}}
+    again = make_pre_post_processors(config, pretrained_path=str(tmp_path), preprocessor_overrides=overrides)
+    assert loaded.config is config
+    for preprocess, _ in (processors, again):
+        batch = preprocess({**depth, "observation.state": torch.zeros(1, 4), "task": ["go"]})
+        assert all(batch[key].equal(values) for key, values in depth.items())
+
+
 def test_depth_follows_the_crop(monkeypatch: pytest.MonkeyPatch) -> None:
     """A pixel's depth and place in the camera's frame stay with what is seen there."""
     policy = make_policy(depth_source="observation", crop_fraction=0.5)

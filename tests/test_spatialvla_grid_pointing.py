@@ -73,7 +73,7 @@ def test_an_answer_is_a_place_a_stone_and_then_cells(share: float) -> None:
     batch["action"] = torch.tensor([[[-0.9, -0.6, -0.3, -0.1], [0.1, 0.3, 0.6, 0.9]]]).repeat(2, 1, 1)
     batch |= {OTHER_PLACES: torch.tensor(PLACES)[torch.tensor([[3, 3], [2, 2]])].flatten(1)}
     batch |= {OTHER_ACTIONS: torch.tensor(2 * [2 * [0.9, 0.9, 0.9, 0.9]])}
-    cells, kept, pointed = policy._targets(batch)
+    cells, kept, pointed = policy.train()._targets(batch)
     meant, other = [[0, 30], [1, 6]], [[3, 30], [2, 6]]
     assert pointed.tokens.tolist() == (other if share else meant)
     first, second = [0, 1, 2, 3], [4, 5, 6, 7]
@@ -85,9 +85,9 @@ def test_an_answer_is_a_place_a_stone_and_then_cells(share: float) -> None:
 
 def test_the_loss_is_the_likelihood_among_a_slots_tokens_of_all_that_is_kept() -> None:
     for vocab in ("slot", "full"):
-        policy = pointing_policy(counterfactual_share=0.5, loss_vocab=vocab)
+        policy = pointing_policy(counterfactual_share=0.5, loss_vocab=vocab).train()
         batch = pointing_batch(policy)
-        policy.generator.manual_seed(1)
+        policy._begin_batch()
         cells, loss_mask_BT, pointed = policy._targets(batch)
         is_other = ~pointed.loss_mask[:, 0]
         assert 0 < is_other.sum() < 4
@@ -112,7 +112,7 @@ def test_the_loss_is_the_likelihood_among_a_slots_tokens_of_all_that_is_kept() -
                         whole = torch.cat([logits[row, i], words[row, i]])
                         losses.append(cross_entropy(whole, tokens[row, i] + starts[i]))
         assert len(losses) == 4 * 6 - int(is_other.sum()) * (1 + 2)
-        policy.generator.manual_seed(1)
+        policy.config.trained_batches = 0
         torch.testing.assert_close(policy(batch)[0], torch.stack(losses).mean())
 
 
@@ -130,7 +130,7 @@ def test_metrics_of_actions_skip_what_points() -> None:
 
 
 def test_no_loss_of_a_place_that_is_not_meant() -> None:
-    policy = pointing_policy(counterfactual_share=1.0)
+    policy = pointing_policy(counterfactual_share=1.0).train()
     policy(pointing_batch(policy))[0].backward()
     grad = policy.cell_head.weight.grad
     assert grad is not None

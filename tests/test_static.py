@@ -154,10 +154,10 @@ def test_of_a_scene_a_chunk_is_its_first_action(recorded: dict[str, Path]) -> No
     assert policy._loss_mask(batch).tolist() == [[True] + 3 * [False], 4 * [True], [True] + 3 * [False]]
     batch["action_is_pad"] = torch.tensor(3 * [[False, False, True, True]])
     assert policy._loss_mask(batch).sum(dim=1).tolist() == [1, 2, 1]
-    policy.config.loss_on_padded_actions = (
-        True  # padding repeats an action, and what follows it is another scene's
-    )
-    assert policy._loss_mask(batch).sum(dim=1).tolist() == [3, 4, 3]
+    policy.config.loss_on_padded_actions = True  # padding repeats the last action, which is another scene's
+    assert policy._loss_mask(batch).sum(dim=1).tolist() == [1, 4, 1]
+    batch["action_is_pad"][:, 1:] = True  # the last scene
+    assert policy._loss_mask(batch).all()
 
 
 def test_scenes_are_no_episodes(recorded: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
@@ -221,7 +221,7 @@ def test_a_policy_points_as_recorded(recorded: dict[str, Path], tmp_path: Path) 
     torch.testing.assert_close(batch["observation.pointing.place"], raw["observation.pointing.place"])
     pointed = policy._point(policy._read(batch), batch["observation.state"])
     torch.testing.assert_close(pointed.gripper, raw["observation.state"][:, :3], atol=1e-5, rtol=0)
-    labels = policy.pointer.draw_labels(batch, policy.config, torch.Generator().manual_seed(0))
+    labels = policy.pointer.labels(batch, 1.0, "fdvla", torch.Generator().manual_seed(0))
     torch.testing.assert_close(
         policy.pointer.places[labels.place], raw["observation.pointing.place"], atol=1e-5, rtol=0
     )

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from pointing_cases import POINTING, with_labels
 from policy_cases import CASES
 from torch import Tensor, distributed
 
@@ -81,3 +82,15 @@ def test_what_happens_between_batches_does_not_change_them(losses: Callable[...,
     usual = losses(lambda policy, batch: None)
     assert len(set(map(float, usual))) == 3
     assert torch.equal(torch.stack(losses(evaluate)), torch.stack(usual))
+
+
+@torch.no_grad()
+def test_a_frames_evaluation_does_not_depend_on_others(policy_type: str) -> None:
+    cases = CASES[policy_type]
+    policy = cases.make_policy(**POINTING[policy_type], **CROPPED).eval()
+    batch = with_labels(cases.make_batch(policy, 4))
+    loss, metrics = policy(batch)
+    assert policy(batch)[0].equal(loss)
+    policy.config.counterfactual_share = 0.0
+    again, same = policy(batch)
+    assert again.equal(loss) and same == metrics

@@ -19,13 +19,13 @@ BOUND_STATISTICS = {
     NormalizationMode.QUANTILE10: ("q10", "q90"),
 }
 CENTRE_AND_DISTANCE = ("mean", "std")
+type Statistics = dict[str, np.ndarray]  # (D,) each, by name
+
 QUANTILE = 0.999  # of the residuals' sizes; larger ones saturate where normalised values are bounded
 MAX_RESIDUALS = 20_000_000  # a dimension; of more, evenly spaced frames are taken
 
 
-def bounds(
-    statistics: dict[str, np.ndarray], mode: NormalizationMode, num_dims: int
-) -> tuple[np.ndarray, np.ndarray]:
+def bounds(statistics: Statistics, mode: NormalizationMode, num_dims: int) -> tuple[np.ndarray, np.ndarray]:
     """(D,) values that become -1 and (D,) values that become 1 when LeRobot normalises.
 
     Raises:

@@ -9,10 +9,16 @@ import torch
 from draccus.utils import DecodingError
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
-from lerobot.processor import PolicyAction, PolicyProcessorPipeline
+from lerobot.processor import (
+    DataProcessorPipeline,
+    PolicyAction,
+    PolicyProcessorPipeline,
+    UnnormalizerProcessorStep,
+)
 from lerobot.utils.device_utils import get_safe_torch_device, is_torch_device_available
 from lerobot.utils.import_utils import register_third_party_plugins
 
+from lerobot_bomb.actions.relative import Statistics
 from lerobot_bomb.checkpoints.checks import PROCESSORS, processor_files
 from lerobot_bomb.checkpoints.names import CONFIG, check_checkpoint
 from lerobot_bomb.checkpoints.processor_files import check_states
@@ -69,6 +75,19 @@ def load_processors(config: PreTrainedConfig) -> tuple[Preprocessor, Postprocess
     for name, processor in zip(PROCESSORS, processors, strict=True):
         check_states(processor.steps, str(folder / name), complete=True)
     return processors
+
+
+def saved_statistics(config: PreTrainedConfig) -> dict[str, Statistics]:
+    """Return the statistics that a checkpoint's processors normalise by; {feature: {statistic: values}}."""
+    processor = DataProcessorPipeline.from_pretrained(
+        str(config.pretrained_path), config_filename=PROCESSORS[1], revision=config.pretrained_revision
+    )
+    (step,) = (step for step in processor.steps if isinstance(step, UnnormalizerProcessorStep))
+    statistics: dict[str, Statistics] = {}
+    for name, values in step.state_dict().items():
+        feature, _, statistic = name.rpartition(".")
+        statistics.setdefault(feature, {})[statistic] = values.numpy()
+    return statistics
 
 
 def write_checkpoint(

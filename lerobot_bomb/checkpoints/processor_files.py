@@ -27,7 +27,7 @@ from lerobot_bomb.compat.hooks.policies import built_policies
 from lerobot_bomb.compat.hooks.processors import check_processors_before_use
 from lerobot_bomb.files import read_json
 from lerobot_bomb.finite import require_finite
-from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep
+from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep, without_geometry
 
 logger = logging.getLogger(__name__)
 
@@ -174,17 +174,19 @@ def check_saved_processors() -> None:
         for name in state_files(content, where, saved_type(config)):
             refuse_link_out(config.parent / name)
 
-    check_processors_before_use(check, _check_loaded, _keeps_statistics)
+    check_processors_before_use(check, _check_loaded, _statistics_to_set)
 
 
-def _keeps_statistics() -> bool:
-    """Return whether a training keeps the statistics of the checkpoint that LeRobot has just loaded."""
+def _statistics_to_set(of_dataset: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the statistics that the processors of the policy just loaded get; None: they keep theirs."""
     built = built_policies()
     config: Any = built[-1].config if built else None
     keeps = getattr(config, "keep_statistics", None)  # None: no policy of ours
     if keeps is False and config.trained_batches:
         _warn_of_new_statistics(config.pretrained_path)
-    return bool(keeps)
+    if keeps is None:
+        return of_dataset
+    return None if keeps else without_geometry(of_dataset)
 
 
 @cache

@@ -33,7 +33,7 @@ MIN_SUCCESS_RATE = 0.1
 class BehaviorPolicy:
     """A policy that acts in place of the expert."""
 
-    begin: Callable[[], None]  # before each episode
+    begin: Callable[[int], None]  # before each episode, whose number it takes
     agent: Agent
 
 
@@ -50,7 +50,7 @@ class EpisodeSource:
         settings, specs = recording.rollouts(self.expert), recording.specs(num_tried)
         if self.behavior is None:
             return RolloutPool(settings, specs, self.num_workers)
-        return RolloutsHere(settings, specs, self.behavior.begin, self.behavior.agent)
+        return RolloutsHere(settings, specs, num_tried, self.behavior.begin, self.behavior.agent)
 
 
 def record_blocks(

@@ -188,7 +188,8 @@ class RolloutsHere:
     Args:
         settings: of all episodes.
         specs: of each episode.
-        begin: called before each episode.
+        first: number of the first episode.
+        begin: called with an episode's number, before it.
         agent: acts instead of the expert, who says what it would have done; failed episodes are kept, too.
     """
 
@@ -196,10 +197,11 @@ class RolloutsHere:
         self,
         settings: Rollouts,
         specs: Iterator[Any],
-        begin: Callable[[], None] = lambda: None,
+        first: int = 0,
+        begin: Callable[[int], None] = lambda number: None,
         agent: Agent | None = None,
     ) -> None:
-        self._worker, self._specs, self._begin = _Worker(settings, agent), specs, begin
+        self._worker, self._specs, self._begin = _Worker(settings, agent), enumerate(specs, first), begin
 
     def __enter__(self) -> Self:
         return self
@@ -208,8 +210,8 @@ class RolloutsHere:
         self._worker.close()
 
     def __iter__(self) -> Iterator[AnyRollout]:
-        for spec in self._specs:
-            self._begin()
+        for number, spec in self._specs:
+            self._begin(number)
             rollout = self._worker.rollout(spec)
             if isinstance(rollout, Exception):
                 raise rollout

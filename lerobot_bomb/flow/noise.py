@@ -22,9 +22,11 @@ class SamplingNoise:
         self._first_episode = 0
         self._generators: list[torch.Generator] = []  # of each row; of all, if they share one
 
-    def begin(self) -> None:
-        """Begin new episodes in the rows of the next batch."""
-        self._first_episode += len(self._generators)
+    def begin(self, first_episode: int | None = None) -> None:
+        """Begin episodes in the rows of the next batch, of these numbers on; None: those that come next."""
+        if first_episode is None:
+            first_episode = self._first_episode + len(self._generators)
+        self._first_episode = first_episode
         self._generators = []
 
     def draw(self, batch_size: int, shape: tuple[int, ...]) -> Tensor:

@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch
+from lerobot.configs import NormalizationMode
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_PREFIX, OBS_STATE
 from torch import Tensor, nn
@@ -108,8 +109,9 @@ class DataUnits(nn.Module):
     action_bounds: Tensor  # (2, D) the same of the environment's actions
     gripper_dims: Tensor  # (3,) int64, of the state
 
-    def __init__(self, action_dim: int):
+    def __init__(self, action_dim: int, action_mode: NormalizationMode):
         super().__init__()
+        self._action_mode = action_mode
         self.register_buffer("state_bounds", torch.tensor([[-1.0], [1.0]]).repeat(1, 3))
         self.register_buffer("action_bounds", torch.tensor([[-1.0], [1.0]]).repeat(1, action_dim))
         self.register_buffer("gripper_dims", torch.arange(3))
@@ -129,14 +131,18 @@ class DataUnits(nn.Module):
 
     def normalised(self, actions_BD: Tensor) -> Tensor:
         """(B, D) actions in the environment's units -> as LeRobot normalises them."""
-        return normalised_actions(actions_BD, self.action_bounds)
+        return normalised_actions(actions_BD, self.action_bounds, self._action_mode)
 
 
-def normalised_actions(actions_BD: Tensor, bounds_2D: Tensor) -> Tensor:
+def normalised_actions(
+    actions_BD: Tensor, bounds_2D: Tensor, mode: NormalizationMode = NormalizationMode.MIN_MAX
+) -> Tensor:
     """Normalise actions (B, D) as LeRobot does; ``bounds_2D`` become -1 and 1."""
     low_D, high_D = bounds_2D
     size_D = high_D - low_D
-    # what never changes is -1, as LeRobot has it
+    # so what never changes is 0 by mean and standard deviation, else -1
+    if mode is NormalizationMode.MEAN_STD:
+        return (actions_BD - (low_D + high_D) / 2) / (size_D / 2 + SMALLEST)
     return 2 * (actions_BD - low_D) / torch.where(size_D == 0, SMALLEST, size_D) - 1
 
 

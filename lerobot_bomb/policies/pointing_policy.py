@@ -35,6 +35,11 @@ class PointingVlaPolicy(VlaPolicy):
         self.board_reader = BoardReader(len(self._cameras) * tokens_per_image, hidden_size)
         self.may_lack = (*self.may_lack, BOARD_READER)
 
+    @property
+    def _other_share(self) -> float:
+        """Share of frames that are given another place; evaluation is on the true ones."""
+        return self.config.counterfactual_share if self.training else 0.0
+
     def _with_board(
         self, loss: Tensor, batch: dict[str, Tensor], features_BPH: Tensor
     ) -> tuple[Tensor, Parts]:

@@ -15,9 +15,10 @@ from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from lerobot_bomb.actions.ensemble import TemporalEnsemble
-from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims
+from lerobot_bomb.actions.relative import RelativeActions, Statistics, bounds, named_dims
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, frozen_buffers
+from lerobot_bomb.checkpoints.folder import saved_statistics
 from lerobot_bomb.checkpoints.starting import check_start
 from lerobot_bomb.compat.hooks.evaluation import run_tasks_in_turn
 from lerobot_bomb.data.columns import (
@@ -35,6 +36,7 @@ from lerobot_bomb.policies.config import ChunkConfig, TokenVlaConfig, VlaConfig
 from lerobot_bomb.policies.relative_config import RelativeVlaConfig
 from lerobot_bomb.training.distributed import SavesTiedWeightsOnce
 from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_fit, trained_with
+from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.inputs import read_state, read_task, read_tensor
 from lerobot_bomb.vlm.layout import INSTRUCTION, PromptLayout
 from lerobot_bomb.vlm.prompt import task_ids, task_text
@@ -72,7 +74,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self._action_names: list[str] | None = None
         if dataset_meta is not None:
             check_chunk_length(config.chunk_size, dataset_meta)
-            self._take_units(dataset_meta)
+            self._take_units(dataset_meta, _action_statistics(dataset_meta))
         # for all that is random in training
         self.generator = torch.Generator().manual_seed(torch.initial_seed())
         self._base_buffers: dict[str, Tensor] | None = None  # of the checkpoint, before it was fitted to data
@@ -95,7 +97,11 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         )
         if dataset_meta is not None:
             policy._base_buffers = frozen_buffers(policy)
-            policy._fit(dataset_meta)
+            if policy.config.keep_statistics:
+                policy._start_on(dataset_meta, saved_statistics(policy.config)[ACTION])
+            else:
+                policy._start_on(dataset_meta, _action_statistics(dataset_meta))
+                policy._fit(dataset_meta)
         return policy
 
     @classmethod
@@ -106,16 +112,21 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         else:
             check_weights_fit(config, cls.shapes)
 
-    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
-        """Take the dataset's facts that a checkpoint keeps."""
+    def _start_on(self, meta: LeRobotDatasetMetadata, actions: Statistics) -> None:
+        """Check a checkpoint's new dataset, and take what training needs and no checkpoint keeps.
+
+        ``actions``: statistics that the processors normalise actions by, the checkpoint's or the dataset's.
+        """
         check_chunk_length(self.config.chunk_size, meta)
-        self._take_units(meta)
+        self._take_units(meta, actions)
+
+    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+        """Fit to a dataset and its statistics what a checkpoint keeps."""
 
     @torch.no_grad()
-    def _take_units(self, meta: LeRobotDatasetMetadata) -> None:
-        assert meta.stats is not None
+    def _take_units(self, meta: LeRobotDatasetMetadata, actions: Statistics) -> None:
         mode = self.config.normalization_mapping["ACTION"]
-        low, high = bounds(meta.stats[ACTION], mode, self.action_dim)
+        low, high = bounds(actions, mode, self.action_dim)
         self.action_unit.copy_(torch.from_numpy(high - low) / 2)
         self._action_names = dim_names(meta.features[ACTION])
 
@@ -125,6 +136,10 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     def reset(self) -> None:
         self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
         self._batch_size: int | None = None  # of the episodes that are under way
+
+    def reset_to(self, first_episode: int) -> None:
+        """Reset, to act as in a batch that begins with this episode of an evaluation."""
+        self.reset()
 
     def drop_queued_actions(self) -> None:
         """Let the next `select_action` predict; LeRobot 0.6.2 calls this when the instruction changes."""
@@ -140,6 +155,13 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
             )
         self._batch_size = batch_size
 
+    def _begin_batch(self) -> None:
+        """Seed all that is random in `forward`: each batch of a training anew, all of an evaluation alike."""
+        if self.training:
+            begin_batch(self.config, self.generator)
+        elif not torch.is_grad_enabled():  # a loop of one's own may learn in evaluation mode
+            self.generator.manual_seed(torch.initial_seed())  # which may be set for each frame
+
     def _loss_mask(self, batch: dict[str, Tensor]) -> Tensor:
         """Return (B, T) bool, the actions that the loss counts; of a static scene only the first."""
         shape = len(batch[ACTION]), self.config.chunk_size
@@ -149,8 +171,9 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         loss_mask_BT = torch.ones_like(is_pad_BT) if self.config.loss_on_padded_actions else ~is_pad_BT
         if isinstance(done_B1 := batch.get(DONE), Tensor):
             is_later_T = torch.arange(shape[1], device=self._device) > 0
-            # actions after a done frame that are no padding belong to the next scene
-            loss_mask_BT = loss_mask_BT & ~(done_B1.reshape(-1, 1).bool() & is_later_T & ~is_pad_BT)
+            # what follows a done frame belongs to the next scene, and so does padding beyond that
+            has_next_B1 = done_B1.reshape(-1, 1).bool() & ~is_pad_BT[:, :2][:, -1:]
+            loss_mask_BT = loss_mask_BT & ~(has_next_B1 & is_later_T)
         return loss_mask_BT
 
     def _l1_parts(self, errors_BTD: Tensor, counted_BTD: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
@@ -417,6 +440,10 @@ class TokenVlaPolicy(VlaPolicy):
         super().reset()
         self._sampling_noise.begin()
 
+    def reset_to(self, first_episode: int) -> None:
+        super().reset_to(first_episode)
+        self._sampling_noise.begin(first_episode)
+
     def predict_action_chunk(
         self,
         batch: dict[str, Tensor],
@@ -436,6 +463,11 @@ class TokenVlaPolicy(VlaPolicy):
             return None
         noise = self._sampling_noise.draw(batch_size, shape)
         return self.config.temperature * noise.to(self._device)
+
+
+def _action_statistics(meta: LeRobotDatasetMetadata) -> Statistics:
+    assert meta.stats is not None
+    return meta.stats[ACTION]
 
 
 def _take_action_names(config: Any, meta: LeRobotDatasetMetadata | None) -> None:

@@ -51,10 +51,15 @@ class LoadedPolicy:
         with acting(config):
             self._env_processors = make_env_pre_post_processors(env_cfg=env_config, policy_cfg=config)
 
-    def begin(self) -> None:
-        """Start an episode with the random state of the first one."""
+    def begin(self, first_episode: int = 0) -> None:
+        """Start a batch of episodes with the random state of the first one, and noise of these numbers on."""
         set_rng_state(self._random_state)
-        self.policy.reset()
+        # of our own types
+        reset_to: Callable[[int], None] | None = getattr(self.policy, "reset_to", None)
+        if reset_to is None:
+            self.policy.reset()
+        else:
+            reset_to(first_episode)
 
     def observe(self, observations: list[dict[str, Any]], instructions: list[str]) -> dict[str, Any]:
         """Return the input of `prepare`: images (B, 3, H, W) in [0, 1] by camera, state, task."""

@@ -98,6 +98,13 @@ class Replay:
         policy = self.record.policy
         return (0, 1) if policy is None else (policy.batch_row or 0, policy.batch_size or 1)
 
+    def _first_episode(self, seed: int) -> int:
+        """Return the number of the batch's first episode in its evaluation of one task; 0 if unknown."""
+        evaluation = self.record.evaluation
+        if evaluation is None or evaluation.seed is None:
+            return 0
+        return max(0, seed - self._place[0] - evaluation.seed)
+
     def _batch_agent(self, viewed: Viewed) -> BatchAgent:
         from lerobot_bomb.checkpoints.identity import identity_of  # LeRobot and torch: seconds
         from lerobot_bomb.viewing.checkpoint import load_policy, scripted_agent
@@ -111,6 +118,7 @@ class Replay:
         loaded = load_policy(path, self.policy_device, *env, self.policy_flags)
         if policy is not None and viewed.spec.perturbations == self.record.spec.perturbations:
             _check_policy(policy, path, identity_of(loaded.policy))
+        loaded.begin(self._first_episode(viewed.spec.seed))
         return loaded.agent
 
 

@@ -27,6 +27,7 @@ from lerobot.utils.constants import (
     OBS_LANGUAGE,
     OBS_LANGUAGE_ATTENTION_MASK,
     OBS_LANGUAGE_TOKENS,
+    OBS_PREFIX,
     OBS_STATE,
 )
 from tokenizers import Tokenizer
@@ -37,6 +38,8 @@ from lerobot_bomb.vlm.prompt import check_template, task_ids
 from lerobot_bomb.vlm.tokenizer import tokenizer_from_tensor, tokenizer_to_tensor
 
 MAX_KEPT_TASKS = 4096
+# inputs that are read in metres and pixels; LeRobot takes them for states
+GEOMETRY = tuple(f"{OBS_PREFIX}{kind}." for kind in ("depth", "intrinsics", "extrinsics"))
 TOKENIZER_KEY = "tokenizer_json"
 
 
@@ -168,6 +171,11 @@ def _read_by_policies(observation: Mapping[str, Any], actions: Any) -> dict[str,
     }
 
 
+def without_geometry[T](statistics: Mapping[str, T]) -> dict[str, T]:
+    """Leave out the statistics of depth and cameras, so that LeRobot does not normalise those."""
+    return {key: of_key for key, of_key in statistics.items() if not key.startswith(GEOMETRY)}
+
+
 def make_task_processors(
     config: PreTrainedConfig,
     dataset_stats: dict[str, dict[str, Tensor]] | None,
@@ -182,7 +190,7 @@ def make_task_processors(
         ValueError: the statistics are not finite.
     """
     require_finite_statistics(dataset_stats)
-    steps = make_default_policy_processor_steps(config, dataset_stats)
+    steps = make_default_policy_processor_steps(config, without_geometry(dataset_stats or {}))
     return make_policy_processor_pipelines(
         input_steps=[
             steps.rename_observations,

@@ -18,6 +18,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_bomb.actions.accuracy import means
+from lerobot_bomb.actions.relative import Statistics
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.checkpoints.adapters import peft_targets
@@ -33,7 +34,6 @@ from lerobot_bomb.policies.pointing import Labels
 from lerobot_bomb.policies.pointing_policy import BOARD_READER, Parts, PointingVlaPolicy, plus
 from lerobot_bomb.policies.policy import RelativeVlaPolicy
 from lerobot_bomb.training.distributed import weighed
-from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.images import crop, encode_images
 from lerobot_bomb.vlm.inputs import read_actions, read_image
 from lerobot_bomb.vlm.layout import INSTRUCTION, STATE
@@ -93,10 +93,15 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         assert self.config.robot_state_feature is not None
         return nn.Linear(self.config.robot_state_feature.shape[0], hidden_size)
 
+    def _start_on(self, meta: LeRobotDatasetMetadata, actions: Statistics) -> None:
+        super()._start_on(meta, actions)
+        if self.pointer is not None:
+            self.config.take_places(meta)
+
     def _fit(self, meta: LeRobotDatasetMetadata) -> None:
         super()._fit(meta)
         if self.pointer is not None:
-            self.pointer.fit(meta, self.config)
+            self.pointer.fit_units(meta, self.config.normalization_mapping)
 
     @property
     def parameter_counts(self) -> dict[str, int]:
@@ -115,6 +120,10 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         super().reset()
         self._sampling_noise.begin()
 
+    def reset_to(self, first_episode: int) -> None:
+        super().reset_to(first_episode)
+        self._sampling_noise.begin(first_episode)
+
     # Training
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
@@ -122,8 +131,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
 
         A chunk gets ``draws_per_chunk`` times, as in CogACT (arXiv 2411.19650); `B` then counts them all.
         """
-        if self.training:
-            begin_batch(self.config, self.generator)
+        self._begin_batch()
         draws = self.config.draws_per_chunk
         actions_BKD, loss_mask_BK, labels = self._targets(batch)
         actions_BKD, loss_mask_BK = (
@@ -183,7 +191,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         actions_BKD, loss_mask_BK = self._actions(batch), self._loss_mask(batch)
         if self.pointer is None:
             return actions_BKD, loss_mask_BK, None
-        labels = self.pointer.draw_labels(batch, self.config, self.generator)
+        labels = self.pointer.labels(batch, self._other_share, self.config.type, self.generator)
         other_B1D = self.to_relative(labels.other_actions[:, None], batch)
         return *labels.given_actions(actions_BKD, loss_mask_BK, other_B1D), labels
 

@@ -6,8 +6,10 @@ Shapes: `B` batch, `P` places, `S` spots where stones lie, `H` hidden size, `D` 
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
+from lerobot.configs import NormalizationMode
 from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
@@ -43,8 +45,14 @@ class Pointer(DataUnits):
     places: Tensor  # (P, 2) metres
     spots: Tensor  # (S, 2) metres
 
-    def __init__(self, hidden_size: int, action_dim: int, places: list[list[float]]):
-        super().__init__(action_dim)
+    def __init__(
+        self,
+        hidden_size: int,
+        action_dim: int,
+        places: list[list[float]],
+        action_mode: NormalizationMode,
+    ):
+        super().__init__(action_dim, action_mode)
         self.register_buffer("places", torch.tensor(places))
         self.features = nn.Sequential(nn.Linear(hidden_size, hidden_size), nn.SiLU())
         self.register_buffer("spots", torch.tensor(SPOTS_XY_M), persistent=False)
@@ -118,16 +126,11 @@ class Pointer(DataUnits):
             "held_loss": binary_cross_entropy_with_logits(pointed.held_logit, labels.held, reduction="none"),
         }
 
-    def fit(self, meta: LeRobotDatasetMetadata, config: FdvlaConfig) -> None:
-        """Take the normalisation from a dataset, and check that the config has its places."""
-        config.take_places(meta)
-        self.fit_units(meta, config.normalization_mapping)
-
-    def draw_labels(
-        self, batch: dict[str, Tensor], config: FdvlaConfig, generator: torch.Generator
+    def labels(
+        self, batch: dict[str, Any], other_share: float, policy_type: str, generator: torch.Generator
     ) -> Labels:
         """Read a batch's labels and draw the given places; actions are as LeRobot normalises them."""
-        labels = Labels.draw(batch, self.places, config.counterfactual_share, config.type, generator)
+        labels = Labels.draw(batch, self.places, other_share, policy_type, generator)
         return replace(labels, other_actions=self.normalised(labels.other_actions))
 
 
@@ -143,9 +146,10 @@ def make_pointer(
         return None
     places = config.take_places(meta)
     assert config.action_feature is not None
-    pointer = Pointer(hidden_size, config.action_feature.shape[0], places)
+    mode = config.normalization_mapping["ACTION"]
+    pointer = Pointer(hidden_size, config.action_feature.shape[0], places, mode)
     if meta is not None:
-        pointer.fit(meta, config)
+        pointer.fit_units(meta, config.normalization_mapping)
     return pointer
 
 

@@ -102,7 +102,8 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
     phi_fit: str = "wrapped"
     # edges and all else of the grids, fitted to the training data
     grid_params: dict[str, Any] | None = None
-    # fit a checkpoint's grids again to new training data, and move the cells' embeddings with them
+    # fit a checkpoint's grids again to new training data, and move the cells' embeddings with them; not with
+    # keep_statistics
     adapt_embeddings: bool = True
 
     # source of depth: "none", "observation" (key observation.depth.CAMERA) or "zoedepth"
@@ -293,5 +294,5 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
             if value != then[flag] and not is_refitted and not is_stored:
                 raise ValueError(
                     f"--policy.{flag}={value!r}: this checkpoint's grids have {then[flag]!r}, which only a "
-                    f"training with --policy.adapt_embeddings=true can change"
+                    f"training with --policy.adapt_embeddings=true and new statistics can change"
                 )

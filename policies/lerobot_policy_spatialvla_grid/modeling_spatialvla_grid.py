@@ -22,6 +22,7 @@ from lerobot_bomb.actions.bins import Bins
 from lerobot_bomb.actions.grid_report import edges_text
 from lerobot_bomb.actions.grid_rows import interpolate_rows
 from lerobot_bomb.actions.grids import ActionGrids
+from lerobot_bomb.actions.relative import Statistics
 from lerobot_bomb.actions.text import TokenRows, digits_needed, number_symbols
 from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.checkpoints.adapters import peft_targets
@@ -32,7 +33,6 @@ from lerobot_bomb.decoding.slots import SlotDecoder
 from lerobot_bomb.policies.pointing_policy import BOARD_READER, PointingVlaPolicy
 from lerobot_bomb.policies.policy import TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
-from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.depth import load_zoedepth
 from lerobot_bomb.vlm.ego3d import Ego3D
 from lerobot_bomb.vlm.images import draw_windows, resized_pixels
@@ -125,7 +125,8 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         """Prepare as other policies do; grids are as they were, or adapt to the new data."""
         complete_depth(config, meta)
         config.check_template_as_trained()
-        config.check_grid_as_trained(is_refitted=meta is not None and config.adapt_embeddings)
+        is_refitted = meta is not None and config.adapt_embeddings and not config.keep_statistics
+        config.check_grid_as_trained(is_refitted=is_refitted)
         super()._prepare(config, meta)
 
     @classmethod
@@ -138,13 +139,16 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
             model.may_lack = (*model.may_lack, "zoedepth")
         return super()._load_as_safetensor(model, model_file, map_location, strict)
 
-    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+    def _start_on(self, meta: LeRobotDatasetMetadata, actions: Statistics) -> None:
+        super()._start_on(meta, actions)
         if self.pointer is not None:
             self.config.take_places(meta)
-            self.pointer.fit(meta, self.config)
+            self.pointer.fit(actions, self.config.normalization_mapping["ACTION"])
+
+    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+        super()._fit(meta)
         if self.config.adapt_embeddings:
             self._adapt(meta)
-        super()._fit(meta)
 
     @torch.no_grad()
     def _init_cells(self) -> None:
@@ -205,8 +209,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         """Return the answer's cross-entropy over the loss mask; ``reduction="none"`` gives (B,)."""
         if reduction not in ("mean", "none"):
             raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
-        if self.training:
-            begin_batch(self.config, self.generator)
+        self._begin_batch()
         cells_BTG, loss_mask_BT, pointed = self._targets(batch)
         with self.autocast():
             pointing_BNH, hidden_BTGH, features_BPH = self._hidden(batch, cells_BTG, pointed.tokens)
@@ -235,7 +238,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
                 loss_mask_BT,
                 Target.nothing(len(loss_mask_BT), self._device),
             )
-        labels, pointed = self.pointer.draw(batch, self.config, self.generator)
+        labels, pointed = self.pointer.labels(batch, self._other_share, self.config.type, self.generator)
         actions_BTD, loss_mask_BT = labels.given_actions(
             actions_BTD, loss_mask_BT, labels.other_actions[:, None]
         )

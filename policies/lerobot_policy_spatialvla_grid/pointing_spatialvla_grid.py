@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from lerobot.configs import NormalizationMode
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
+from lerobot_bomb.actions.relative import Statistics, bounds
 from lerobot_bomb.bomb.pointing import PointedAt
-from lerobot_bomb.policies.pointing import Labels, normalised_actions, unit_bounds
+from lerobot_bomb.policies.pointing import Labels, normalised_actions
 
 if TYPE_CHECKING:
     from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import SpatialvlaGridConfig
@@ -117,18 +119,19 @@ class CellPointer(nn.Module):
         )
 
     @torch.no_grad()
-    def fit(self, meta: LeRobotDatasetMetadata, config: "SpatialvlaGridConfig") -> None:
-        """Take the normalisation of actions from a dataset."""
-        self.action_bounds.copy_(unit_bounds(meta, ACTION, config.normalization_mapping["ACTION"]))
+    def fit(self, actions: Statistics, mode: NormalizationMode) -> None:
+        """Take the normalisation of actions from their statistics."""
+        low_D, high_D = bounds(actions, mode, self.action_bounds.shape[1])
+        self.action_bounds.copy_(torch.from_numpy(np.stack([low_D, high_D])))
 
-    def draw(
-        self, batch: dict[str, Any], config: "SpatialvlaGridConfig", generator: torch.Generator
+    def labels(
+        self, batch: dict[str, Any], other_share: float, policy_type: str, generator: torch.Generator
     ) -> tuple[Labels, Target]:
-        """Draw a batch's labels, actions as LeRobot normalises them, and the tokens that are given.
+        """Read a batch's labels, actions as LeRobot normalises them, and draw the tokens that are given.
 
         Counterfactual places carry no loss.
         """
-        labels = Labels.draw(batch, self.places, config.counterfactual_share, config.type, generator)
+        labels = Labels.draw(batch, self.places, other_share, policy_type, generator)
         tokens_B2 = torch.stack([labels.given, self.stones.number_of(labels.stone_xy)], dim=1)
         loss_mask_B2 = torch.stack([~labels.is_other, torch.ones_like(labels.is_other)], dim=1)
         others_BD = normalised_actions(labels.other_actions, self.action_bounds)
@@ -146,5 +149,6 @@ def make_pointer(config: "SpatialvlaGridConfig", meta: LeRobotDatasetMetadata | 
     assert config.action_feature is not None
     pointer = CellPointer(config.take_places(meta), config.stone_cells(), config.action_feature.shape[0])
     if meta is not None:
-        pointer.fit(meta, config)
+        assert meta.stats is not None
+        pointer.fit(meta.stats[ACTION], config.normalization_mapping["ACTION"])
     return pointer

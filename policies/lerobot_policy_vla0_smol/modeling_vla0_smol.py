@@ -17,6 +17,7 @@ from torch.nn.functional import cross_entropy, pad
 
 from lerobot_bomb.actions.accuracy import counted_numbers, exact_numbers, means, read_numbers
 from lerobot_bomb.actions.bins import Bins
+from lerobot_bomb.actions.relative import Statistics
 from lerobot_bomb.actions.text import (
     END,
     IGNORED,
@@ -39,7 +40,6 @@ from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.policies.pointing_policy import BOARD_READER, Parts, PointingVlaPolicy
 from lerobot_bomb.policies.policy import RelativeVlaPolicy, TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
-from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.color_jitter import ColorJitter
 from lerobot_bomb.vlm.images import crop, encode_images
 from lerobot_bomb.vlm.inputs import read_actions, read_image
@@ -102,10 +102,15 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         self._decoded: Decoded | None = None  # in the last prediction
         self.reset()
 
+    def _start_on(self, meta: LeRobotDatasetMetadata, actions: Statistics) -> None:
+        super()._start_on(meta, actions)
+        if self.pointer is not None:
+            self.pointer.check(meta, self.config)
+
     def _fit(self, meta: LeRobotDatasetMetadata) -> None:
         super()._fit(meta)
         if self.pointer is not None:
-            self.pointer.fit(meta, self.config)
+            self.pointer.fit_units(meta, self.config.normalization_mapping)
 
     def _num_numbers(self, num_steps: int) -> int:
         """Count the numbers of an answer with this many actions."""
@@ -124,8 +129,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         """Return the answer's cross-entropy over the loss mask; ``reduction="none"`` gives (B,)."""
         if reduction not in ("mean", "none"):
             raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
-        if self.training:
-            begin_batch(self.config, self.generator)
+        self._begin_batch()
         with self.autocast():
             prompt = self.prompt(batch)
             bins_BN, loss_mask_BN = self._targets(batch)
@@ -214,10 +218,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         actions_BTD, loss_mask_BT = self.to_relative(actions_BTD, batch), self._loss_mask(batch)
         if self.pointer is None:
             return self._action_targets(actions_BTD, loss_mask_BT)
-        config = self.config
-        # evaluation is on the true places
-        share = config.counterfactual_share if self.training else 0.0
-        labels = self.pointer.labels(batch, share, config.type, self.generator)
+        labels = self.pointer.labels(batch, self._other_share, self.config.type, self.generator)
         other_B1D = self.to_relative(labels.other_actions[:, None], batch)
         targets = self._action_targets(*labels.given_actions(actions_BTD, loss_mask_BT, other_B1D))
         pointing = self.pointer.bins_of(labels, self._state(batch)), self.pointer.loss_mask(labels)

@@ -34,7 +34,7 @@ class TextPointer(DataUnits):
 
     def __init__(self, config: Vla0SmolConfig):
         assert config.action_feature is not None
-        super().__init__(config.action_feature.shape[0])
+        super().__init__(config.action_feature.shape[0], config.normalization_mapping["ACTION"])
         self._range_m = config.pointing_range_m
         self._bins = Bins(config.n_action_bins, config.bin_mode)
 
@@ -69,8 +69,8 @@ class TextPointer(DataUnits):
             name: (errors_BJ[:, part] * self._range_m, counted_BJ[:, part]) for name, part in parts.items()
         }
 
-    def fit(self, meta: LeRobotDatasetMetadata, config: Vla0SmolConfig) -> None:
-        """Take the normalisation of the numbers from a dataset.
+    def check(self, meta: LeRobotDatasetMetadata, config: Vla0SmolConfig) -> None:
+        """Check that a dataset can be trained on.
 
         Raises:
             ValueError: the dataset has no pointing labels, or some are out of range.
@@ -84,7 +84,6 @@ class TextPointer(DataUnits):
                     f"--policy.pointing_range_m={self._range_m}: {key} of {meta.repo_id} is up to "
                     f"{farthest_m:.3g} m from the origin in x or y; give at least that"
                 )
-        self.fit_units(meta, config.normalization_mapping)
 
 
 def make_pointer(config: Vla0SmolConfig, meta: LeRobotDatasetMetadata | None) -> TextPointer | None:
@@ -93,5 +92,6 @@ def make_pointer(config: Vla0SmolConfig, meta: LeRobotDatasetMetadata | None) ->
         return None
     pointer = TextPointer(config)
     if meta is not None:
-        pointer.fit(meta, config)
+        pointer.check(meta, config)
+        pointer.fit_units(meta, config.normalization_mapping)
     return pointer

@@ -17,14 +17,22 @@ from lerobot_bomb.compat.hooks.replace import replace
 def check_processors_before_use(
     check: Callable[[dict[str, Any], str, Path], Any],
     check_loaded: Callable[[Sequence[Any], str, Path], None],
-    keeps_statistics: Callable[[], bool],
+    statistics_to_set: Callable[[dict[str, Any]], dict[str, Any] | None],
 ) -> None:
     """Have saved processors checked before LeRobot's loader builds their steps, and again once loaded.
 
     First `check(its JSON, where, config.json)` sees what will be built, then `check_loaded(steps, where,
     config.json)`. From the Hub, states and config.json, which may be missing, are of the JSON's commit.
-    If `keeps_statistics()`, the saved ones stay where `lerobot-train` would set those of its dataset.
+    Where `lerobot-train` would set its dataset's statistics, it sets `statistics_to_set(those)`; None: the
+    saved ones stay.
     """
+
+    def with_statistics(values: dict[str, Any]) -> dict[str, Any]:
+        if "stats" not in values:
+            return values
+        others = {name: value for name, value in values.items() if name != "stats"}
+        statistics = statistics_to_set(values["stats"])
+        return others if statistics is None else {**others, "stats": statistics}
 
     def around(usual: Callable[..., Any]) -> Callable[..., Any]:
         def build(cls: type, *args: Any, **kwargs: Any) -> Any:
@@ -36,11 +44,9 @@ def check_processors_before_use(
                 given["hub_download_kwargs"] = given["hub_download_kwargs"] | {"revision": commits[-1]}
             where, config_file = f"{given['model_id']}, {content.get('name')}", _config_file(given)
             check(content, where, config_file)
-            if any("stats" in values for values in given["overrides"].values()) and keeps_statistics():
-                given["overrides"] = {
-                    step: {name: value for name, value in values.items() if name != "stats"}
-                    for step, values in given["overrides"].items()
-                }
+            given["overrides"] = {
+                step: with_statistics(values) for step, values in given["overrides"].items()
+            }
             steps, unused = usual(*bound.args, **bound.kwargs)
             check_loaded(steps, where, config_file)
             return steps, unused
