@@ -31,7 +31,7 @@ help:
 	@echo "make setup      only set up .venv"
 
 setup: $(STAMP)
-	@$(BIN)/python -c "from lerobot_env_mujoco.backend import ensure_gl_backend; ensure_gl_backend()" \
+	@$(BIN)/python -c "from lerobot_env_bomb.shared.backend import ensure_gl_backend; ensure_gl_backend()" \
 		|| { echo "Set-up is done, but rendering does not work, see above." >&2; exit 1; }
 	@echo "Set up: source $(BIN)/activate, then lerobot-bomb doctor checks it and make demo shows it"
 

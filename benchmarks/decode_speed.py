@@ -31,9 +31,9 @@ from torch.utils.data import default_collate
 from lerobot_bomb.decoding.decoder import Guess, Prompt
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.writer import NumberWriter
-from lerobot_policy_spatialvla_grid import SpatialvlaGridConfig
-from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import DRAFTS
-from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
+from lerobot_policy_bomb.spatialvla_grid import SpatialvlaGridConfig
+from lerobot_policy_bomb.spatialvla_grid.configuration_spatialvla_grid import DRAFTS
+from lerobot_policy_bomb.spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 BATCH_SIZES = 1, 16
 RANDOM_DIMS, RANDOM_IMAGE_SIZE = 7, 128  # of the original's actions

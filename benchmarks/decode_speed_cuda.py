@@ -35,8 +35,8 @@ from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone
 from lerobot_bomb.vlm.presets import nano_config
 from lerobot_bomb.vlm.prompt import PromptTokens
 from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer
-from lerobot_policy_vla0_smol import Vla0SmolConfig
-from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+from lerobot_policy_bomb.vla0_smol import Vla0SmolConfig
+from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 BAR_IS_ON, MIN_RATIO = "bfloat16, batch of 1", 8.0
 PARTS = "decode", "policy"

@@ -27,7 +27,7 @@ from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.vlm.backbone import Backbone
 from lerobot_bomb.vlm.images import crop, resized_pixels
-from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
+from lerobot_policy_bomb.spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import time
 
 from lerobot.envs import EnvConfig
 
-from lerobot_env_bomb.configuration_bomb import BombEnvConfig
+from lerobot_env_bomb.bomb.configuration_bomb import BombEnvConfig
 
 NUM_ENVS = 2
 

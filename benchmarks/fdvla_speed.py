@@ -33,8 +33,8 @@ from torch import Tensor
 from lerobot_bomb.vlm.presets import nano_qwen_config
 from lerobot_bomb.vlm.qwen import QwenPrompt
 from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer
-from lerobot_policy_fdvla import FdvlaConfig
-from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
+from lerobot_policy_bomb.fdvla import FdvlaConfig
+from lerobot_policy_bomb.fdvla.modeling_fdvla import FdvlaPolicy
 
 MIN_RATIO = 3.0
 EVERY_STEP, ONCE = "prompt read in every step", "prompt read once"

@@ -32,7 +32,7 @@ from lerobot_bomb.conditions import MAX_LEVEL, NONE
 from lerobot_bomb.libero.assets import prepare_libero
 from lerobot_bomb.libero.episode import LiberoSpec
 from lerobot_bomb.libero.perturbations import LIBERO_AXES
-from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.bomb.env import BombEnv
 
 NUM_STEPS = 8  # of each episode
 TARGETS = {"bomb": "targets: a reset 1.5, a step 1.1", "bomb_libero": "targets: a reset 1.3, fast step 0.25"}
@@ -99,7 +99,7 @@ def measure_libero(num_episodes: int) -> Rows:
     from lerobot.envs.factory import make_env as make_stock
     from lerobot.envs.factory import make_env_config
 
-    from lerobot_env_bomb_libero.env import BombLiberoEnv
+    from lerobot_env_bomb.libero.env import BombLiberoEnv
 
     size = {"observation_height": LIBERO_IMAGE_SIZE, "observation_width": LIBERO_IMAGE_SIZE}
     config = make_env_config("libero", task=LIBERO_SUITE, task_ids=[0], **size)

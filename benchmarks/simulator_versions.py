@@ -71,7 +71,7 @@ def main() -> None:
 
 def measure_here(simulator: str, num_seeds: int) -> Measured:
     """Run all cases in this process."""
-    from lerobot_env_bomb.env import BombEnv
+    from lerobot_env_bomb.bomb.env import BombEnv
 
     env = BombEnv()
     env.reset(seed=0)
@@ -92,7 +92,7 @@ def outcome_of(spec: EpisodeSpec, num_seeds: int) -> Outcome:
     """Run the expert's episodes of a spec; return their hashes (SHA-256) and how they ended."""
     from lerobot_bomb.bomb.observation import PIXELS, RenderOptions
     from lerobot_bomb.envs.rollout import expert_agent, run_episode
-    from lerobot_env_bomb.env import BombEnv
+    from lerobot_env_bomb.bomb.env import BombEnv
 
     states, images, results = hashlib.sha256(), hashlib.sha256(), []
     env = BombEnv(spec, RenderOptions(image_size=IMAGE_SIZE))

@@ -19,7 +19,7 @@ from transformers import (
 from lerobot_bomb.vlm.presets import nano_config, nano_qwen_config
 from lerobot_bomb.vlm.prompt import normalize_task
 from lerobot_bomb.vlm.tokenizer import nano_tokenizer
-from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 QWEN_TOKENS = ("<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>", "<|fim_pad|>")
 # images are not whole patches, as those of the first 2.2B: 6 x 6 patches of 14 pixels and 2 left over

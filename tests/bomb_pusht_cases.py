@@ -20,7 +20,7 @@ def pushing_actions(seed: int, block_xy: np.ndarray, num: int) -> np.ndarray:
 
 def pusht_env(condition: str = "none", **kwargs: Any) -> Any:
     """An environment of this condition; a PushTSpec's other fields and the environment's own by name."""
-    from lerobot_env_bomb_pusht.env import BombPushTEnv
+    from lerobot_env_bomb.pusht.env import BombPushTEnv
 
     of_spec = {name: kwargs.pop(name) for name in ("instruction", "max_steps") if name in kwargs}
     return BombPushTEnv(PushTSpec(0, perturbations=condition, **of_spec), **kwargs)

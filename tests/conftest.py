@@ -156,7 +156,7 @@ def kept_work() -> Iterator[None]:
         if "lerobot" in sys.modules:  # importing it takes seconds, and many tests do without
             look_at_columns_once(patch)
             check_numbers_once(patch)
-        contexts = keep_contexts(patch) if "lerobot_env_bomb.render" in sys.modules else []
+        contexts = keep_contexts(patch) if "lerobot_env_bomb.bomb.render" in sys.modules else []
         yield
         for context in contexts:
             context.free()
@@ -165,7 +165,7 @@ def kept_work() -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def small_pictures() -> Iterator[int | None]:
     """Draw small what is drawn for people alone, which takes longer than all else; yield the usual size."""
-    env: Any = sys.modules.get("lerobot_env_bomb.env")
+    env: Any = sys.modules.get("lerobot_env_bomb.bomb.env")
     with pytest.MonkeyPatch.context() as patch:
         usual = getattr(env, "PERSON_IMAGE_SIZE", None)
         if env is not None:
@@ -177,7 +177,7 @@ def small_pictures() -> Iterator[int | None]:
 def usual_pictures(small_pictures: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw for people as large as users see it."""
     if small_pictures is not None:
-        monkeypatch.setattr("lerobot_env_bomb.env.PERSON_IMAGE_SIZE", small_pictures)
+        monkeypatch.setattr("lerobot_env_bomb.bomb.env.PERSON_IMAGE_SIZE", small_pictures)
 
 
 @pytest.fixture(scope="session", autouse=True)

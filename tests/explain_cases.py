@@ -63,7 +63,7 @@ def moment() -> tuple[dict[str, Any], str, dict[str, dict[str, Any]], dict[str, 
 def end_episodes_after(max_steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let episodes of `place` end early, whose many steps most of an explanation's time would go to."""
     suite = replace(find_suite("place"), max_steps=max_steps)
-    monkeypatch.setattr("lerobot_env_bomb.env.find_suite", lambda _: suite)
+    monkeypatch.setattr("lerobot_env_bomb.bomb.env.find_suite", lambda _: suite)
 
 
 def ask(

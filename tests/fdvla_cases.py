@@ -8,8 +8,8 @@ from lerobot.policies.factory import make_pre_post_processors
 from torch import Tensor
 from variants import layers_of
 
-from lerobot_policy_fdvla import FdvlaConfig
-from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
+from lerobot_policy_bomb.fdvla import FdvlaConfig
+from lerobot_policy_bomb.fdvla.modeling_fdvla import FdvlaPolicy
 
 WORKSPACE, WRIST = "observation.images.workspace", "observation.images.wrist"
 SIZE, STATE_DIMS = 64, 4

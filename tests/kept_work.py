@@ -49,7 +49,7 @@ def keep_contexts(patch: pytest.MonkeyPatch) -> list[Any]:
 
     Return those that no environment has.
     """
-    render: Any = sys.modules["lerobot_env_bomb.render"]
+    render: Any = sys.modules["lerobot_env_bomb.bomb.render"]
     usual, idle, here = render.GLContext, [], threading.main_thread()
 
     class KeptContext:

@@ -18,8 +18,8 @@ from lerobot_bomb.actions.grid_settings import ActionGroup
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.vlm.tokenizer import nano_tokenizer
-from lerobot_policy_spatialvla_grid import SpatialvlaGridConfig
-from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
+from lerobot_policy_bomb.spatialvla_grid import SpatialvlaGridConfig
+from lerobot_policy_bomb.spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 CAMERA = "observation.images.image"
 TASK = "What action should the robot take to pick the cup?"  # the original's prompt has it in lower case

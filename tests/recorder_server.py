@@ -195,7 +195,7 @@ def serve() -> None:
     # the seconds that recorders save
     from lerobot_bomb.commands import record  # noqa: F401
     from lerobot_bomb.data import blocks, resumable  # noqa: F401
-    from lerobot_env_mujoco.backend import ensure_gl_backend
+    from lerobot_env_bomb.shared.backend import ensure_gl_backend
 
     ensure_gl_backend()
     resumable.BLOCK_EPISODES = 2

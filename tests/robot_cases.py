@@ -19,7 +19,7 @@ from torch import Tensor
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import ACTION_NAMES, CAMERAS, STATE_NAMES, RenderOptions
 from lerobot_bomb.checkpoints.folder import Postprocessor, Preprocessor, load_processors, read_config
-from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.bomb.env import BombEnv
 
 MOTORS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 KEYS = [f"{motor}.pos" for motor in MOTORS]

@@ -8,8 +8,8 @@ from lerobot.policies.factory import make_pre_post_processors
 from torch import Tensor
 from variants import layers_of
 
-from lerobot_policy_spatialvla_grid import SpatialvlaGridConfig
-from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
+from lerobot_policy_bomb.spatialvla_grid import SpatialvlaGridConfig
+from lerobot_policy_bomb.spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 WORKSPACE, WRIST = "observation.images.workspace", "observation.images.wrist"
 SIZE = 64

@@ -7,7 +7,7 @@ from vla0_smol_cases import make_batch, make_policy
 
 from lerobot_bomb.actions.accuracy import counted_numbers, exact_numbers, means, read_numbers
 from lerobot_bomb.actions.text import NumberTokens, number_symbols
-from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 END = 11
 

@@ -21,19 +21,19 @@ from lerobot_bomb.bomb.perturbations import AXES, NUISANCES
 from lerobot_bomb.bomb.suites.place import FORMS, STONE
 from lerobot_bomb.conditions import MAX_LEVEL
 from lerobot_bomb.envs.photometric import Photometric
-from lerobot_env_bomb.alternatives import alternatives
-from lerobot_env_bomb.axes.dynamics import Dynamics
-from lerobot_env_bomb.axes.language import Wording
-from lerobot_env_bomb.axes.light import Light
-from lerobot_env_bomb.axes.object import GREY, StoneLook
-from lerobot_env_bomb.axes.stones import Stones
-from lerobot_env_bomb.axes.table import TABLE_RGB, TableLook
-from lerobot_env_bomb.axes.transform import Transform
-from lerobot_env_bomb.model import compile_scene
-from lerobot_env_bomb.perturb import PerturbedEpisode as Episode
-from lerobot_env_bomb.perturb import sample_episode
-from lerobot_env_bomb.robots import ROBOTS
-from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
+from lerobot_env_bomb.bomb.alternatives import alternatives
+from lerobot_env_bomb.bomb.axes.dynamics import Dynamics
+from lerobot_env_bomb.bomb.axes.language import Wording
+from lerobot_env_bomb.bomb.axes.light import Light
+from lerobot_env_bomb.bomb.axes.object import GREY, StoneLook
+from lerobot_env_bomb.bomb.axes.stones import Stones
+from lerobot_env_bomb.bomb.axes.table import TABLE_RGB, TableLook
+from lerobot_env_bomb.bomb.axes.transform import Transform
+from lerobot_env_bomb.bomb.model import compile_scene
+from lerobot_env_bomb.bomb.perturb import PerturbedEpisode as Episode
+from lerobot_env_bomb.bomb.perturb import sample_episode
+from lerobot_env_bomb.bomb.robots import ROBOTS
+from lerobot_env_bomb.bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
 
 SEEDS = st.integers(0, 2**31)
 AXIS = st.sampled_from(list(AXES))

@@ -12,9 +12,9 @@ from lerobot_bomb.bomb.observation import CAMERAS, MAX_STEP_M, RenderOptions
 from lerobot_bomb.bomb.perturbations import AXES, NUISANCES
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.suites.place import targets_of
-from lerobot_env_bomb.env import BombEnv
-from lerobot_env_bomb.perturb import sample_episode
-from lerobot_env_bomb.scene import HIDDEN_RGBA
+from lerobot_env_bomb.bomb.env import BombEnv
+from lerobot_env_bomb.bomb.perturb import sample_episode
+from lerobot_env_bomb.bomb.scene import HIDDEN_RGBA
 
 SIZE = 64
 VISUAL = [axis for axis in AXES if "images" in AXES[axis].changes]

@@ -20,7 +20,7 @@ def choose_backend(preamble: str = "", **environment: str) -> subprocess.Complet
     """Run ensure_gl_backend() in a fresh process without MUJOCO_GL unless given."""
     code = f"""
 import os
-from lerobot_env_mujoco import backend
+from lerobot_env_bomb.shared import backend
 {preamble}
 print(backend.ensure_gl_backend(), os.environ["MUJOCO_GL"], os.environ["PYOPENGL_PLATFORM"])
 """
@@ -119,7 +119,7 @@ def test_an_unknown_backend_is_refused() -> None:
 DRAWN = """
 import hashlib, os
 {first}
-from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.bomb.env import BombEnv
 
 env = BombEnv()
 pixels = env.reset(seed=1)[0]["pixels"]
@@ -173,7 +173,7 @@ def test_pyopengl_loaded_for_a_display_is_named() -> None:
 BESIDE_A_NEIGHBOUR = """
 import contextlib, mujoco
 import numpy as np
-from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.bomb.env import BombEnv
 
 env = BombEnv()
 before = env.reset(seed=1)[0]["pixels"]

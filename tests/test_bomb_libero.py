@@ -15,7 +15,7 @@ from lerobot_bomb.libero.episode import LiberoFailure, LiberoSpec, initial_state
 from lerobot_bomb.libero.perturbations import LIBERO_AXES
 from lerobot_bomb.libero.wording import FORMS, orders_of, reworded
 from lerobot_bomb.results.libero import LiberoResult
-from lerobot_env_bomb_libero.configuration_bomb_libero import BombLiberoEnvConfig
+from lerobot_env_bomb.libero.configuration_bomb_libero import BombLiberoEnvConfig
 
 VERBS = {
     "pick",

@@ -57,7 +57,7 @@ ACTIONS = np.array([[0.5, -0.3, -0.6, 0.1, 0, 0.2, -1], [0.2, 0.4, -0.9, 0, 0.1,
 
 
 def make(condition: str, task_id: int = 0, render_preset: str = "stock", **kwargs: Any) -> Any:
-    module = importlib.import_module("lerobot_env_bomb_libero.env")
+    module = importlib.import_module("lerobot_env_bomb.libero.env")
     max_steps = kwargs.pop("max_steps", None)
     size = {"observation_height": IMAGE_SIZE, "observation_width": IMAGE_SIZE}
     scene = size | {"obs_type": "pixels_agent_pos", "render_preset": render_preset}
@@ -181,8 +181,8 @@ def test_objects_start_elsewhere_apart_from_each_other_and_on_the_table(env: Any
 
 @pytest.mark.parametrize("seed", range(3))
 def test_what_was_in_view_of_the_scenes_camera_stays_there(env: Any, seed: int) -> None:
-    from lerobot_env_bomb_libero.axes.camera import _is_in_view
-    from lerobot_env_mujoco.rotations import matrix_of
+    from lerobot_env_bomb.libero.axes.camera import _is_in_view
+    from lerobot_env_bomb.shared.rotations import matrix_of
 
     def shown(condition: str) -> np.ndarray:
         begin(env, condition, seed)
@@ -246,7 +246,7 @@ def test_without_drawing_states_are_the_same_and_films_are_drawn(
 
 
 def test_a_region_of_the_table_is_no_object(libero: Libero) -> None:
-    from lerobot_env_bomb_libero.scene import LiberoScene
+    from lerobot_env_bomb.libero.scene import LiberoScene
 
     sites = {"main_table_stove_front_region": SimpleNamespace(parent_name=None)}
     env = SimpleNamespace(object_sites_dict=sites, obj_of_interest=["plate_1", *sites])
@@ -351,7 +351,7 @@ def test_every_task_can_be_perturbed(libero_with_assets: Libero, task_id: int) -
 
 @pytest.mark.long
 def test_sync_and_async_workers_see_the_same_bits(libero_with_assets: Libero) -> None:
-    from lerobot_env_bomb_libero.configuration_bomb_libero import BombLiberoEnvConfig
+    from lerobot_env_bomb.libero.configuration_bomb_libero import BombLiberoEnvConfig
 
     config = BombLiberoEnvConfig(
         task_ids=[0], perturbations=["all:3"], observation_height=IMAGE_SIZE, observation_width=IMAGE_SIZE

@@ -22,7 +22,7 @@ from lerobot_bomb.conditions import nuisances_of
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.pusht.episode import PushTFailure, PushTSpec, pusht_failure_of
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES
-from lerobot_env_bomb_pusht.configuration_bomb_pusht import BombPushTEnvConfig
+from lerobot_env_bomb.pusht.configuration_bomb_pusht import BombPushTEnvConfig
 
 gym_pusht = pytest.importorskip(
     "gym_pusht.envs.pusht", reason="gym-pusht is not installed: pip install '.[pusht]'"

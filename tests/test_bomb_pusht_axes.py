@@ -16,9 +16,9 @@ from lerobot_bomb.pusht.perturbations import PUSHT_AXES, PushTCondition, pusht_m
 
 pytest.importorskip("gym_pusht", reason="gym-pusht is not installed: pip install '.[pusht]'")
 
-from lerobot_env_bomb_pusht.axes.goal import GoalPose
-from lerobot_env_bomb_pusht.axes.language import FORMS
-from lerobot_env_bomb_pusht.episode import TEMPLATES, sample_pusht_episode
+from lerobot_env_bomb.pusht.axes.goal import GoalPose
+from lerobot_env_bomb.pusht.axes.language import FORMS
+from lerobot_env_bomb.pusht.episode import TEMPLATES, sample_pusht_episode
 
 SEEDS = st.integers(0, 2**31)
 AXIS = st.sampled_from(list(PUSHT_AXES))

@@ -11,7 +11,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
 from lerobot_bomb.compat.hooks.policies import built_policies, training_data
-from lerobot_env_bomb.configuration_bomb import BombEnvConfig
+from lerobot_env_bomb.bomb.configuration_bomb import BombEnvConfig
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from lerobot_bomb.bomb.suites import long as long_suite
 from lerobot_bomb.envs.rollout import Moment, expert_agent, make_env, run_episode
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.groups import read_results
-from lerobot_env_bomb.perturb import PerturbedEpisode, sample_episode
+from lerobot_env_bomb.bomb.perturb import PerturbedEpisode, sample_episode
 
 TASKS = {"goal": goal_suite.TASKS, "long": long_suite.TASKS}
 SMALL = RenderOptions(image_size=32)

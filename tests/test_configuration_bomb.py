@@ -12,7 +12,7 @@ from lerobot_bomb.bomb.perturbations import NUISANCES
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.envs.vector import LazyVectorEnv
 from lerobot_bomb.flag_errors import FlagError
-from lerobot_env_bomb.configuration_bomb import BombEnvConfig
+from lerobot_env_bomb.bomb.configuration_bomb import BombEnvConfig
 
 
 def test_policy_side_features() -> None:

@@ -30,7 +30,7 @@ from safetensors.torch import load_file, save_file
 
 from lerobot_bomb.actions.grid_settings import ActionGroup
 from lerobot_bomb.vlm.tokenizer import nano_tokenizer
-from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
+from lerobot_policy_bomb.spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import CAMERAS, RenderOptions
 from lerobot_bomb.envs.vector import LazyVectorEnv
-from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.bomb.env import BombEnv
 
 import mujoco  # isort: skip  (after the env, which chooses an OpenGL backend)
 

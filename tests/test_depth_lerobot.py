@@ -75,7 +75,7 @@ def test_features_agree_and_none_of_them_is_a_camera(dataset: Path) -> None:
     from lerobot.envs import env_to_policy_features
     from lerobot.utils.feature_utils import dataset_to_policy_features
 
-    from lerobot_env_bomb.configuration_bomb import BombEnvConfig
+    from lerobot_env_bomb.bomb.configuration_bomb import BombEnvConfig
 
     metadata = LeRobotDatasetMetadata(REPO_ID, root=dataset)
     features = dataset_to_policy_features(metadata.features)
@@ -122,7 +122,7 @@ def test_an_interrupted_recording_resumes_to_the_same_bytes(
 def test_a_policy_in_lerobot_eval_gets_what_the_env_shows(
     use_async: str, stock_cli: Run, rollouts: list[Rollout], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lerobot_policy_bomb_expert.modeling_bomb_expert import BombExpertPolicy
+    from lerobot_policy_bomb.bomb_expert.modeling_bomb_expert import BombExpertPolicy
 
     batches, select_action = [], BombExpertPolicy.select_action
 

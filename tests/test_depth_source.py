@@ -17,7 +17,7 @@ from published_spatialvla import (
 )
 from safetensors.torch import load_file
 
-from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
+from lerobot_policy_bomb.spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 DEPTH, INTRINSICS = "observation.depth.image", "observation.intrinsics.image"
 

@@ -52,12 +52,12 @@ def test_a_policy_that_cannot_be_imported_is_shown_with_its_cause(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delitem(sys.modules, doctor.DISTRIBUTION)
-    monkeypatch.setitem(sys.modules, "lerobot_policy_fdvla", None)
+    monkeypatch.setitem(sys.modules, "lerobot_policy_bomb.fdvla", None)
     monkeypatch.setattr(doctor, "CHECKS", (doctor.check_types,))
     assert main(["doctor"]) == 1
     output = capsys.readouterr().out
     assert "BROKEN  types:" in output
-    assert "import of lerobot_policy_fdvla halted" in output
+    assert "import of lerobot_policy_bomb.fdvla halted" in output
 
 
 def test_a_package_that_registers_no_type_of_its_name_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from lerobot_bomb.vlm.depth import lattice_points, observed_depth, observed_intr
 from lerobot_bomb.vlm.ego3d import Ego3D, encode_points
 from lerobot_bomb.vlm.images import CropWindows, draw_windows
 from lerobot_bomb.vlm.intrinsics import crop_intrinsics
-from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.bomb.env import BombEnv
 
 import mujoco  # isort: skip  (after the env, which chooses an OpenGL backend)
 

@@ -15,12 +15,12 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-import lerobot_env_bomb
+import lerobot_env_bomb.bomb
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
-from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.bomb.env import BombEnv
 
 SMALL = RenderOptions(image_size=32)
 STILL = np.array([0, 0, 0, 1], dtype=np.float32)
@@ -299,7 +299,7 @@ def test_a_result_that_cannot_be_written_is_an_error_that_names_the_flag() -> No
 
 
 @pytest.mark.parametrize("render_mode", ["rgb_array", None])
-@pytest.mark.parametrize("gym_id", sorted(lerobot_env_bomb.GYM_IDS))
+@pytest.mark.parametrize("gym_id", sorted(lerobot_env_bomb.bomb.GYM_IDS))
 def test_gymnasiums_checker_has_nothing_to_say(gym_id: str, render_mode: str | None) -> None:
     env = gymnasium.make(gym_id, render_options=SMALL, render_mode=render_mode).unwrapped
     assert env.render_mode == render_mode
@@ -321,7 +321,7 @@ def test_without_a_render_mode_render_draws_nothing_and_says_so() -> None:
 
 def test_import_is_light() -> None:
     heavy = ("torch", "lerobot", "transformers", "cv2")
-    script = f"import sys, lerobot_env_bomb.env; print([m for m in {heavy} if m in sys.modules])"
+    script = f"import sys, lerobot_env_bomb.bomb.env; print([m for m in {heavy} if m in sys.modules])"
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert run.stdout.strip() == "[]", run.stderr
 
@@ -332,7 +332,7 @@ def test_a_process_that_never_closes_its_env_exits_silently() -> None:
 import weakref
 anything = set()
 weakref.finalize(anything, int)
-from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.bomb.env import BombEnv
 env = BombEnv()
 env.reset()
 """

@@ -9,8 +9,8 @@ from lerobot_bomb.bomb.expert import FLOOR_M, expert_action
 from lerobot_bomb.bomb.observation import MAX_STEP_M, WORKSPACE_LOW_M, RenderOptions
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 from lerobot_bomb.envs.rollout import expert_agent, run_episode
-from lerobot_env_bomb.env import BombEnv
-from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW
+from lerobot_env_bomb.bomb.env import BombEnv
+from lerobot_env_bomb.bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
 SMALL = RenderOptions(image_size=32)
 TARGET_XYZ = np.array([0.0, 0.0, 0.0095])

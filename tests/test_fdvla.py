@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.nn.functional import scaled_dot_product_attention
 
 from lerobot_bomb.flow.path import PathPoint, path_point
-from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
-from lerobot_policy_fdvla.networks_fdvla import SideBySide
+from lerobot_policy_bomb.fdvla.modeling_fdvla import FdvlaPolicy
+from lerobot_policy_bomb.fdvla.networks_fdvla import SideBySide
 
 ENERGY: dict[str, Any] = {"consistency": "energy_vjp"}
 

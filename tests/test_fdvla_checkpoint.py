@@ -18,7 +18,7 @@ from lerobot_bomb.actions.relative import bounds
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
-from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
+from lerobot_policy_bomb.fdvla.modeling_fdvla import FdvlaPolicy
 
 REPO_ID = "test/fdvla"
 

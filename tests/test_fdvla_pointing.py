@@ -18,8 +18,8 @@ from lerobot_bomb.explain.restoration import Corruption
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.policies.board_reader import NUM_SPOTS
 from lerobot_bomb.policies.pointing import OTHER_ACTIONS, OTHER_PLACES, PLACE, STONE, number_of
-from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
-from lerobot_policy_fdvla.pointing_fdvla import Pointed, Pointer
+from lerobot_policy_bomb.fdvla.modeling_fdvla import FdvlaPolicy
+from lerobot_policy_bomb.fdvla.pointing_fdvla import Pointed, Pointer
 
 PLACES = [[-0.09, 0.09], [0.0, 0.0], [0.09, -0.045], [0.17, 0.0]]
 # without reading the board: that is in test_board_reader.py

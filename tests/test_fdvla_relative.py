@@ -20,7 +20,7 @@ from torch import Tensor
 
 from lerobot_bomb.data.columns import read_columns
 from lerobot_bomb.flag_errors import FlagError
-from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
+from lerobot_policy_bomb.fdvla.modeling_fdvla import FdvlaPolicy
 
 REACH = 0.1  # of an action from the state, where states wander over several units
 CHUNK = 4

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lerobot_bomb.flow.real_time import guided
 from lerobot_bomb.flow.samplers import SAMPLERS, sample
-from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
+from lerobot_policy_bomb.fdvla.modeling_fdvla import FdvlaPolicy
 
 OPTIONS: list[dict[str, Any]] = [
     *({"sampler": sampler} for sampler in SAMPLERS),

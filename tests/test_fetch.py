@@ -21,12 +21,12 @@ from lerobot_bomb.envs.rollout import expert_agent, run_episode
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.groups import read_results
-from lerobot_env_bomb import fetch_files
-from lerobot_env_bomb.configuration_bomb import BombEnvConfig
-from lerobot_env_bomb.env import BombEnv
-from lerobot_env_bomb.fetch import PREFIX, fetch_joints
-from lerobot_env_bomb.perturb import sample_episode
-from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
+from lerobot_env_bomb.bomb import fetch_files
+from lerobot_env_bomb.bomb.configuration_bomb import BombEnvConfig
+from lerobot_env_bomb.bomb.env import BombEnv
+from lerobot_env_bomb.bomb.fetch import PREFIX, fetch_joints
+from lerobot_env_bomb.bomb.perturb import sample_episode
+from lerobot_env_bomb.bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
 
 SMALL = RenderOptions(image_size=32)
 SPEC = EpisodeSpec(seed=0, robot="fetch")

@@ -16,7 +16,7 @@ from torch import Tensor
 from lerobot_bomb.actions.relative import RelativeActions, bounds
 from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.vlm.backbone import load_backbone
-from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 STATE, WRIST, ACTION = "observation.state", "observation.images.wrist", "action"
 # a part of the model that every answer depends on

@@ -20,8 +20,8 @@ from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 from lerobot_bomb.bomb.suite import Episode
 from lerobot_bomb.bomb.suites import SUITES
-from lerobot_env_bomb.env import BombEnv
-from lerobot_env_bomb.perturb import sample_episode
+from lerobot_env_bomb.bomb.env import BombEnv
+from lerobot_env_bomb.bomb.perturb import sample_episode
 
 SMALL = RenderOptions(image_size=32)
 SWAP, CLEAR_ROW, GATHER = 2, 7, 8  # tasks of `goal`

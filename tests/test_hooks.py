@@ -86,7 +86,7 @@ small = dict(device="cpu", pretrained_backbone_weights=None, dim_model=8, n_head
 policy = make_policy(ACTConfig(**small), env_cfg=PushtEnv())
 assert parser.get_path_arg("policy", ["--policy.path=me/x"]) == "me/x"
 stock = changed()
-from lerobot_env_bomb.configuration_bomb import BombEnvConfig
+from lerobot_env_bomb.bomb.configuration_bomb import BombEnvConfig
 config = BombEnvConfig()
 used = changed()
 config.create_envs(n_envs=1)

@@ -7,15 +7,14 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-SHARED = "lerobot_env_mujoco"  # by environments
+ENVS, POLICIES = "lerobot_env_bomb", "lerobot_policy_bomb"
+FOLDERS = {ENVS: ROOT / "envs" / ENVS, POLICIES: ROOT / "policies" / POLICIES}
+SHARED = f"{ENVS}.shared"  # by environments
+# an environment or a policy type each: "lerobot_env_bomb.pusht"
 PACKAGES = {
-    path.name for folder in ("envs", "policies") for path in (ROOT / folder).iterdir() if path.is_dir()
+    f"{name}.{path.parent.name}" for name, folder in FOLDERS.items() for path in folder.glob("*/__init__.py")
 } - {SHARED}
-ENTRY = "lerobot_policy_bomb"
-POLICY_PREFIX = "lerobot_policy_"
-POLICY_TYPES = {name.removeprefix(POLICY_PREFIX) for name in PACKAGES if name.startswith(POLICY_PREFIX)} - {
-    ENTRY.removeprefix(POLICY_PREFIX)
-}
+POLICY_TYPES = {name.partition(".")[2] for name in PACKAGES if name.startswith(POLICIES)}
 # what is about certain policies
 NAMES_POLICIES = {
     "checkpoints/spatialvla_folder.py": {"spatialvla_grid"},  # whose format it writes
@@ -82,6 +81,11 @@ def imported(path: Path, top_level_only: bool = False) -> set[str]:
     return {name.split(".")[0] for name in imported_modules(path, top_level_only)}
 
 
+def imported_packages(path: Path) -> set[str]:
+    """The environments and policies among what a file imports."""
+    return {".".join(name.split(".")[:2]) for name in imported_modules(path)} & PACKAGES
+
+
 def files(*folders: str) -> list[Path]:
     found = [path for folder in folders for path in sorted((ROOT / folder).rglob("*.py"))]
     assert found, f"no Python files in {folders}"
@@ -95,7 +99,7 @@ def require_none(what: str, found: Iterable[tuple[Path, set[str]]]) -> None:
 
 
 def test_core_imports_no_env_and_no_policy() -> None:
-    found = ((path, imported(path) & PACKAGES) for path in files(CORE))
+    found = ((path, imported(path) & FOLDERS.keys()) for path in files(CORE))
     require_none("the core imports environments or policies", found)
 
 
@@ -136,26 +140,21 @@ def test_only_commands_read_a_command_line() -> None:
     assert readers == {"commands", "compat"}  # compat/help.py takes a mark of argparse
 
 
-def of_others(folder: str, path: Path) -> set[str]:
-    """Environments and policies that a file of `folder` imports beside its own."""
-    own = path.relative_to(ROOT / folder).parts[0]
-    return set() if own == ENTRY else imported(path) & (PACKAGES - {own})
-
-
 def test_envs_and_policies_import_none_but_their_own() -> None:
-    for folder in ("envs", "policies"):
-        found = ((path, of_others(folder, path)) for path in files(folder))
-        require_none(f"{folder}/ import other environments or policies", found)
+    for name in FOLDERS:
+        for package in (each for each in PACKAGES if each.startswith(name)):
+            own = sorted((FOLDERS[name] / package.partition(".")[2]).rglob("*.py"))
+            found = ((path, imported_packages(path) - {package}) for path in own)
+            require_none(f"{package} imports other environments or policies", found)
 
 
-def test_the_entry_module_imports_every_env_and_policy() -> None:
-    registered = imported(ROOT / "policies" / ENTRY / "__init__.py") & PACKAGES
-    assert registered == PACKAGES - {ENTRY}
+def test_the_plugin_imports_every_env_and_policy() -> None:
+    assert imported_packages(FOLDERS[POLICIES] / "__init__.py") == PACKAGES
 
 
-def test_nothing_imports_the_entry_module() -> None:
-    for path in files("lerobot_bomb", "envs", "policies", "benchmarks"):
-        assert ENTRY not in imported(path), path
+def test_what_environments_share_imports_none() -> None:
+    shared = sorted((FOLDERS[ENVS] / "shared").rglob("*.py"))
+    require_none(f"{SHARED} imports environments", ((path, imported_packages(path)) for path in shared))
 
 
 def heavy_imports(path: Path) -> set[str]:

@@ -21,7 +21,7 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.envs.vector import NEW_ROLLOUT_OPTION, LazyVectorEnv
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.groups import read_results
-from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.bomb.env import BombEnv
 
 SMALL = RenderOptions(image_size=32)
 SEEDS = (10, 11)

@@ -33,9 +33,9 @@ from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.results.inference import Inference, Query
 from lerobot_bomb.results.record import MEASURED, different_fields
 from lerobot_bomb.smoothness import smoothness
-from lerobot_env_bomb.configuration_bomb import BombEnvConfig
-from lerobot_env_bomb.env import BombEnv
-from lerobot_policy_bomb_random.configuration_bomb_random import BombRandomConfig
+from lerobot_env_bomb.bomb.configuration_bomb import BombEnvConfig
+from lerobot_env_bomb.bomb.env import BombEnv
+from lerobot_policy_bomb.bomb_random.configuration_bomb_random import BombRandomConfig
 
 SMALL = RenderOptions(image_size=32)
 ENV = BombEnvConfig(image_size=32, fps=1)  # episodes of 10 steps

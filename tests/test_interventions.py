@@ -10,7 +10,7 @@ from safetensors.torch import load_file
 from vla0_smol_cases import STATS, WORKSPACE, WRIST, make_policy, raw_batch
 
 from lerobot_bomb.explain.interventions import PREPROCESSOR_FILE, BlankImages, ReplaceTasks, intervene
-from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
+from lerobot_policy_bomb.vla0_smol import make_vla0_smol_pre_post_processors
 
 SWAPPED = {"to the left": "to the right", "to the right": "to the left"}
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import lerobot_env_bomb.env
+import lerobot_env_bomb.bomb.env
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import AGENT_POS, PIXELS, RenderOptions
 from lerobot_bomb.bomb.perturbations import AXES, NUISANCES
 from lerobot_bomb.bomb.suites import SUITES
-from lerobot_env_bomb.env import BombEnv
-from lerobot_env_bomb.perturb import PerturbedEpisode, draw_perturbation, sample_episode
+from lerobot_env_bomb.bomb.env import BombEnv
+from lerobot_env_bomb.bomb.perturb import PerturbedEpisode, draw_perturbation, sample_episode
 
 MARKER = "goal_marker"
 VISUAL_AXES = [axis for axis in NUISANCES if AXES[axis].changes == ("images",)]
@@ -34,7 +34,7 @@ def start(spec: EpisodeSpec, asked_seed: int, monkeypatch: pytest.MonkeyPatch) -
     episode = replace(episode, perturbation=draw_perturbation(episode))
     env = BombEnv(spec, RenderOptions(image_size=64))
     with monkeypatch.context() as patch:
-        patch.setattr(lerobot_env_bomb.env, "sample_episode", lambda _: episode)
+        patch.setattr(lerobot_env_bomb.bomb.env, "sample_episode", lambda _: episode)
         observation, _ = env.reset(seed=spec.seed)
     env.close()
     return observation[PIXELS] | {AGENT_POS: observation[AGENT_POS]}

@@ -15,8 +15,8 @@ from lerobot_bomb.commands import main as cli
 from lerobot_bomb.libero.assets import Libero
 from lerobot_bomb.libero.expert import LiberoState, libero_expert_action
 from lerobot_bomb.libero.goals import check_predicates, expert_order
-from lerobot_env_mujoco.rotations import rotation
-from lerobot_policy_bomb_expert.configuration_bomb_expert import BombExpertConfig
+from lerobot_env_bomb.shared.rotations import rotation
+from lerobot_policy_bomb.bomb_expert.configuration_bomb_expert import BombExpertConfig
 
 TASK = "(define (problem X) (:init (On a b)) (:goal (And ({} a b) (Open c))))"
 RECORD = ["record", "--env.type=bomb_libero", "--repo_id=test/x", "--episodes=1"]

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(
 UUID = "GPU-5f0a3c5e-9d5e-4a0c-8f0e-1b2c3d4e5f60"
 DRAW = """
 import os
-import lerobot_env_bomb_libero.renderer
+import lerobot_env_bomb.libero.renderer
 from robosuite.utils.binding_utils import GLContext
 
 GLContext(max_width=16, max_height=16, device_id=-1).make_current()

@@ -54,7 +54,7 @@ def record() -> Recording:
     from lerobot.envs.utils import preprocess_observation
     from lerobot.policies.act.configuration_act import ACTConfig
 
-    importlib.import_module("lerobot_env_mujoco.backend").ensure_gl_backend()
+    importlib.import_module("lerobot_env_bomb.shared.backend").ensure_gl_backend()
     size = {"observation_height": IMAGE_SIZE, "observation_width": IMAGE_SIZE}
     config = make_env_config("libero", task=SUITE, task_ids=[0], hard_reset=False, **size)
     vector: Any = make_env(config, n_envs=1)[SUITE][0]

@@ -23,7 +23,7 @@ from lerobot_bomb.bomb.streams import recorder_noise
 from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.envs.rollout import Moment, add_noise, expert_agent, run_episode
-from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.bomb.env import BombEnv
 
 SUCCESSES, COMPARED = 0.9, 0.98  # least shares of episodes and of steps
 NOISE = 0.05  # on what is executed, as in recordings

@@ -94,7 +94,7 @@ def test_metaworld_is_run(
     policy_type: str, stock_cli: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Run three steps each of two episodes."""
-    from lerobot_env_mujoco.backend import ensure_gl_backend
+    from lerobot_env_bomb.shared.backend import ensure_gl_backend
 
     ensure_gl_backend()  # before metaworld imports MuJoCo
     pytest.importorskip("metaworld", reason="Meta-World is not installed: pip install 'lerobot[metaworld]'")

@@ -60,7 +60,7 @@ def test_the_wheel_holds_every_module_the_scene_and_the_checkpoints(wheel: Path)
     }
     expected |= {f"lerobot_bomb/configs/{name}.yaml" for name in preset_names()}
     assert packed == expected
-    assert "lerobot_env_bomb/scene.xml" in packed
+    assert "lerobot_env_bomb/bomb/scene.xml" in packed
     assert {f"{name.split('/')[0]}/py.typed" for name in packed} <= packed  # every package is typed
 
 

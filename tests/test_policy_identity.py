@@ -26,8 +26,8 @@ from lerobot_bomb.compat.hooks.policies import built_policies
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.results.origin import PolicyIdentity
-from lerobot_env_bomb.configuration_bomb import BombEnvConfig
-from lerobot_policy_bomb_expert.configuration_bomb_expert import BombExpertConfig
+from lerobot_env_bomb.bomb.configuration_bomb import BombEnvConfig
+from lerobot_policy_bomb.bomb_expert.configuration_bomb_expert import BombExpertConfig
 
 ENV = BombEnvConfig(image_size=32, fps=1)
 

@@ -28,7 +28,7 @@ from lerobot_bomb.data.unfinished import (
     parameters_file,
     unfinished_folder,
 )
-from lerobot_env_bomb.configuration_bomb import BombEnvConfig
+from lerobot_env_bomb.bomb.configuration_bomb import BombEnvConfig
 
 FLAGS = ["record", "--repo_id=test/x", "--episodes=1"]
 RECORDING = Recording("test/x", episodes=1)

@@ -11,8 +11,8 @@ import pytest
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_env_bomb.env import BombEnv
-from lerobot_env_bomb.render import CAPTION_BACKGROUND, CAPTION_MARGIN_PX, compose_caption
+from lerobot_env_bomb.bomb.env import BombEnv
+from lerobot_env_bomb.bomb.render import CAPTION_BACKGROUND, CAPTION_MARGIN_PX, compose_caption
 
 SMALL = RenderOptions(image_size=32)
 STILL = np.zeros(4, dtype=np.float32)
@@ -23,7 +23,7 @@ import functools, gc, os, sys, threading
 import gymnasium
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.bomb.env import BombEnv
 
 make = functools.partial(BombEnv, EpisodeSpec(seed=0), RenderOptions(image_size=32))
 env = make()

@@ -15,11 +15,11 @@ from lerobot_bomb.commands.main import main
 from lerobot_bomb.envs.rollout import Moment, expert_agent, make_env, run_episode
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.groups import groups_of
-from lerobot_env_bomb.perturb import sample_episode
-from lerobot_env_bomb.render import Renderer, renderer_of
-from lerobot_env_bomb.sapien_render import SapienRenderer, device_name
-from lerobot_env_bomb.scene import Scene
-from lerobot_env_bomb.static_scene import starting_scene
+from lerobot_env_bomb.bomb.perturb import sample_episode
+from lerobot_env_bomb.bomb.render import Renderer, renderer_of
+from lerobot_env_bomb.bomb.sapien_render import SapienRenderer, device_name
+from lerobot_env_bomb.bomb.scene import Scene
+from lerobot_env_bomb.bomb.static_scene import starting_scene
 
 SPEC = EpisodeSpec(seed=1000)
 SIZE, LARGE = 64, 256

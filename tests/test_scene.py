@@ -6,10 +6,10 @@ from lerobot_bomb.bomb.episode import PHYSICS_HZ, ROBOTS, EpisodeSpec
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.observation import CAMERAS, RenderOptions
 from lerobot_bomb.bomb.suites.place import STONE
-from lerobot_env_bomb.model import parked_xyz
-from lerobot_env_bomb.perturb import sample_episode
-from lerobot_env_bomb.render import CameraRenderer
-from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
+from lerobot_env_bomb.bomb.model import parked_xyz
+from lerobot_env_bomb.bomb.perturb import sample_episode
+from lerobot_env_bomb.bomb.render import CameraRenderer
+from lerobot_env_bomb.bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
 
 NUM_SUBSTEPS = 20
 BLACK_AT, WHITE_AT = (1, 1), (3, 3)

@@ -9,10 +9,10 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import RenderOptions, action_bounds
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
-from lerobot_env_bomb.configuration_bomb import BombEnvConfig
-from lerobot_env_bomb.env import BombEnv
-from lerobot_policy_bomb_expert.configuration_bomb_expert import BombExpertConfig
-from lerobot_policy_bomb_random.configuration_bomb_random import BombRandomConfig
+from lerobot_env_bomb.bomb.configuration_bomb import BombEnvConfig
+from lerobot_env_bomb.bomb.env import BombEnv
+from lerobot_policy_bomb.bomb_expert.configuration_bomb_expert import BombExpertConfig
+from lerobot_policy_bomb.bomb_random.configuration_bomb_random import BombRandomConfig
 
 
 def make(scripted_type: str, **fields: object):

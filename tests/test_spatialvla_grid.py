@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import cosine_similarity, cross_entropy
 
 from lerobot_bomb.flag_errors import FlagError
-from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
+from lerobot_policy_bomb.spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 PLAIN: dict[str, Any] = {"crop_fraction": 1.0}
 BEFORE = Path(__file__).parent / "fixtures" / "before_layout" / "spatialvla_grid"

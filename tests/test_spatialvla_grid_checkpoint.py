@@ -22,7 +22,7 @@ from spatialvla_grid_cases import make_batch, make_config, make_policy, stats
 from lerobot_bomb.data.columns import read_columns
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
-from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
+from lerobot_policy_bomb.spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 REPO_ID = "test/grids"
 GRIPPER = {"dims": [3], "transform": "identity", "bins": [16]}

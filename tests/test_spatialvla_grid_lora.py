@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 
 from lerobot_bomb.checkpoints.folder import read_config
 from lerobot_bomb.commands.main import main
-from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
+from lerobot_policy_bomb.spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 pytest.importorskip("peft")
 

@@ -15,8 +15,8 @@ from torch.nn.functional import cross_entropy
 
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.policies.pointing import OTHER_ACTIONS, OTHER_PLACES, PLACE, STONE
-from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
-from lerobot_policy_spatialvla_grid.pointing_spatialvla_grid import StoneCells
+from lerobot_policy_bomb.spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
+from lerobot_policy_bomb.spatialvla_grid.pointing_spatialvla_grid import StoneCells
 
 PLACES = [[-0.09, 0.09], [0.0, 0.0], [0.09, -0.045], [0.17, 0.0]]
 STONES = StoneCells((-0.13, -0.13), (0.21, 0.13), 0.04)  # 9 x 7

@@ -34,9 +34,9 @@ from lerobot_bomb.data.rollout_pool import RolloutSettings, collect
 from lerobot_bomb.envs.rollout import Moment, make_env
 from lerobot_bomb.evaluation.trivial import Demonstrations
 from lerobot_bomb.policies.pointing import places_of
-from lerobot_env_bomb.env import BombEnv
-from lerobot_policy_fdvla import FdvlaConfig
-from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
+from lerobot_env_bomb.bomb.env import BombEnv
+from lerobot_policy_bomb.fdvla import FdvlaConfig
+from lerobot_policy_bomb.fdvla.modeling_fdvla import FdvlaPolicy
 
 SMALL = RenderOptions(image_size=32)
 IMAGES = Recording("test/episodes", episodes=1, seed=3, task="all", image_size=32, images=True, pointing=True)

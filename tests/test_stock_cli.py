@@ -110,8 +110,8 @@ def test_a_video_ends_with_the_outcome(
 ) -> None:
     from lerobot.scripts import lerobot_eval
 
-    from lerobot_env_bomb import env
-    from lerobot_env_bomb.render import compose_caption
+    from lerobot_env_bomb.bomb import env
+    from lerobot_env_bomb.bomb.render import compose_caption
 
     drawn, filmed = [], []
 

@@ -230,7 +230,7 @@ def test_what_is_no_such_evaluation_is_told(
 def test_libero_is_run_from_the_initial_states_in_order(
     libero_with_assets: Libero, run_all: Callable[[Manifest], Store], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lerobot_env_mujoco.backend import ensure_gl_backend
+    from lerobot_env_bomb.shared.backend import ensure_gl_backend
 
     ensure_gl_backend()  # before robosuite imports MuJoCo
     from lerobot.envs import libero

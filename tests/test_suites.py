@@ -17,8 +17,8 @@ from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks
 from lerobot_bomb.bomb.suites import object as object_suite
 from lerobot_bomb.bomb.suites import spatial as spatial_suite
 from lerobot_bomb.envs.rollout import expert_agent, make_env, run_episode
-from lerobot_env_bomb.perturb import PerturbedEpisode, sample_episode
-from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW
+from lerobot_env_bomb.bomb.perturb import PerturbedEpisode, sample_episode
+from lerobot_env_bomb.bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
 NEW_SUITES = ("object", "spatial")
 SEEDS = st.integers(0, 2**31)

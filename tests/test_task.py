@@ -13,9 +13,9 @@ from lerobot_bomb.bomb.suites.place import (
     TEMPLATES,
     targets_of,
 )
-from lerobot_env_bomb.perturb import PerturbedEpisode as Episode
-from lerobot_env_bomb.perturb import sample_episode
-from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW
+from lerobot_env_bomb.bomb.perturb import PerturbedEpisode as Episode
+from lerobot_env_bomb.bomb.perturb import sample_episode
+from lerobot_env_bomb.bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
 SEEDS = st.integers(0, 2**31)
 CORNER_CAPTURE = {(0, 1): "white", (1, 0): "white"}  # black in the corner would have no liberty

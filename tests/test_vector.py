@@ -15,7 +15,7 @@ from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.results.inference import Query
 from lerobot_bomb.results.origin import Evaluation
-from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.bomb.env import BombEnv
 
 SMALL = RenderOptions(image_size=32)
 SEEDS = [11, 12]

@@ -30,7 +30,7 @@ from lerobot_bomb.viewing.bomb import bomb_episode
 from lerobot_bomb.viewing.episode import ViewedRun, write_episodes
 from lerobot_bomb.viewing.rerun_bomb import BombLog
 from lerobot_bomb.viewing.sheet import BAR_HEIGHT, title_bar
-from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.bomb.env import BombEnv
 
 SPEC = EpisodeSpec(seed=4, target=(3, 2), color="white", fps=5)
 OPTIONS = RenderOptions(image_size=64)
@@ -215,7 +215,7 @@ def test_random_actions_are_those_of_the_seed_and_fail(
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from vla0_smol_cases import STATS, make_policy
 
-    from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
+    from lerobot_policy_bomb.vla0_smol import make_vla0_smol_pre_post_processors
 
     stats = {**STATS, "action": {"min": STATS["action"]["min"] / 2, "max": STATS["action"]["max"] / 2}}
 

@@ -21,7 +21,7 @@ from lerobot_bomb.envs.rollout import Moment
 from lerobot_bomb.pusht.episode import BOARD_PX
 from lerobot_bomb.viewing.pusht import PushTView
 from lerobot_bomb.viewing.sheet import BAR_HEIGHT
-from lerobot_env_bomb_pusht.env import BombPushTEnv
+from lerobot_env_bomb.pusht.env import BombPushTEnv
 
 CONDITION, STEPS = "table:3+goal:2", 12
 FLAGS = ["view", "--env.type=bomb_pusht", "--seed=3", f"--max_steps={STEPS}", f"--perturbations={CONDITION}"]

@@ -13,7 +13,7 @@ from lerobot_bomb.actions.text import IGNORED
 from lerobot_bomb.vlm.images import resize
 from lerobot_bomb.vlm.prompt import normalize_task
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
-from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 VLA0_JITTER = [0.2, 0.2, 0.2, 0.05]
 

@@ -32,8 +32,8 @@ from lerobot_bomb.decoding.graph_decoder import GraphDecoder
 from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.decoding.writer import continue_prompt
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
-from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
-from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+from lerobot_policy_bomb.vla0_smol import make_vla0_smol_pre_post_processors
+from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 Batch = dict[str, Any]
 

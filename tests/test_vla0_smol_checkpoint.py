@@ -31,8 +31,8 @@ from vla0_smol_cases import (
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.vlm import task_tokenizer
 from lerobot_bomb.vlm.prompt import task_ids
-from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
-from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+from lerobot_policy_bomb.vla0_smol import make_vla0_smol_pre_post_processors
+from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 
 @pytest.fixture(scope="module")

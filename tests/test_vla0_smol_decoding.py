@@ -10,7 +10,7 @@ from vla0_smol_cases import WORKSPACE, make_batch, make_policy, numbers_of
 from lerobot_bomb.actions.text import IGNORED
 from lerobot_bomb.decoding.decoder import Decoded, decode_numbers, likeliest
 from lerobot_bomb.flow.noise import SamplingNoise, gumbel
-from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 
 def learn(policy: Vla0SmolPolicy, batch: dict[str, Any]) -> None:

@@ -21,8 +21,8 @@ from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.policies.pointing import OTHER_ACTIONS, OTHER_PLACES, PLACE, STONE
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
-from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
-from lerobot_policy_vla0_smol.pointing_vla0_smol import NUM_NUMBERS
+from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+from lerobot_policy_bomb.vla0_smol.pointing_vla0_smol import NUM_NUMBERS
 
 # a millimetre a bin, and three digits each; without reading the board: that is in test_board_reader.py
 POINTING: dict[str, Any] = {

@@ -14,7 +14,7 @@ from vla0_smol_cases import make_batch, make_policy, raw_batch, sequence
 from lerobot_bomb.actions.text import END, SPACE
 from lerobot_bomb.vlm.prompt import QWEN_CHAT, PromptTokens, normalize_task
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
-from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from relative_cases import NAMES, make_dataset
 from vla0_smol_cases import make_batch, make_config, make_policy
 
 from lerobot_bomb.decoding.decoder import Decoded
-from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 
 def build(meta: LeRobotDatasetMetadata | None, **options: Any) -> Vla0SmolPolicy:

@@ -81,7 +81,7 @@ def seen_losses() -> Iterator[list[float]]:
 def draws_by_sample() -> Iterator[None]:
     """Let `fdvla` draw time and noise as a function of the sample, whatever batch it is in."""
     from lerobot_bomb.flow.path import PathPoint
-    from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
+    from lerobot_policy_bomb.fdvla.modeling_fdvla import FdvlaPolicy
 
     draw = FdvlaPolicy._draw_point
 
@@ -151,7 +151,7 @@ def main(folder: Path) -> None:
     from accelerate import debug_launcher
     from lerobot.scripts import lerobot_train  # noqa: F401
 
-    import lerobot_policy_fdvla.modeling_fdvla  # noqa: F401
+    import lerobot_policy_bomb.fdvla.modeling_fdvla  # noqa: F401
 
     debug_launcher(train, (folder,), NUM_PROCESSES)
 

@@ -7,8 +7,8 @@ from lerobot.configs import FeatureType, PolicyFeature
 from variants import layers_of
 
 from lerobot_bomb.actions.text import NumberTokens
-from lerobot_policy_vla0_smol import Vla0SmolConfig, make_vla0_smol_pre_post_processors
-from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+from lerobot_policy_bomb.vla0_smol import Vla0SmolConfig, make_vla0_smol_pre_post_processors
+from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 WORKSPACE, WRIST = "observation.images.workspace", "observation.images.wrist"
 TASK = "Place a black stone on the Go board at row {}, column 1."

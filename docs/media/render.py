@@ -7,7 +7,7 @@ import numpy as np
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.envs.rollout import expert_agent, play
-from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.bomb.env import BombEnv
 
 SEED = 9  # many stones on the board
 GIF_PAUSE = 8  # frames that the last image stays

@@ -22,7 +22,7 @@ _OWN = {
                 "share", (0.06, 0.12, 0.2, 0.3, 0.45), "contrast of stripes, checks or speckles on the table"
             ),
         },
-        "lerobot_env_bomb.axes.table:TableLook",
+        "lerobot_env_bomb.bomb.axes.table:TableLook",
     ),
     "reflectance": Axis(
         "gloss of stones, tray and table; a lamp's reflection on the board",
@@ -35,7 +35,7 @@ _OWN = {
                 "share", (0.08, 0.16, 0.24, 0.32, 0.4), "opacity of a lamp's reflection, drawn on the board"
             ),
         },
-        "lerobot_env_bomb.axes.reflectance:Reflectance",
+        "lerobot_env_bomb.bomb.axes.reflectance:Reflectance",
     ),
     "stones": Axis(
         "number of stones on the board, and their shift off the intersections",
@@ -44,7 +44,7 @@ _OWN = {
             "extra": Magnitude("stones", (1, 1, 2, 2, 3), "additional on the board"),
             "shift": Magnitude("mm", (0.8, 1.6, 2.4, 3.2, 4.0), "of each stone, in a random direction"),
         },
-        "lerobot_env_bomb.axes.stones:Stones",
+        "lerobot_env_bomb.bomb.axes.stones:Stones",
     ),
     "start": Axis(
         "where the gripper and the stone to be moved are at the start",
@@ -55,7 +55,7 @@ _OWN = {
             ),
             "gripper": Magnitude("mm", (16, 32, 48, 64, 82), "shift of the gripper, in a random direction"),
         },
-        "lerobot_env_bomb.axes.start:Start",
+        "lerobot_env_bomb.bomb.axes.start:Start",
     ),
     "photometric": Axis(
         "colour balance, brightness and noise of the camera's sensor",
@@ -65,7 +65,7 @@ _OWN = {
             "brightness": Magnitude("share", (0.03, 0.06, 0.09, 0.12, 0.15), "up or down, all channels"),
             "noise": Magnitude("grey levels", (2, 4, 6, 8, 11), "standard deviation in each pixel"),
         },
-        "lerobot_env_bomb.axes.photometric:Sensor",
+        "lerobot_env_bomb.bomb.axes.photometric:Sensor",
     ),
     "camera": Axis(
         "angle, field of view and distance of the cameras; board, tray and stone stay in view",
@@ -78,7 +78,7 @@ _OWN = {
                 "share", (0.03, 0.06, 0.09, 0.12, 0.15), "further or nearer, the workspace camera"
             ),
         },
-        "lerobot_env_bomb.axes.camera:Camera",
+        "lerobot_env_bomb.bomb.axes.camera:Camera",
     ),
     "light": Axis(
         "intensity and direction of the light",
@@ -88,13 +88,13 @@ _OWN = {
             "bright": Magnitude("factor", (1.15, 1.32, 1.52, 1.75, 2.0), "on all light, if it is brightened"),
             "tilt": Magnitude("degrees", (7, 14, 21, 28, 35), "of the lamp, in a random direction"),
         },
-        "lerobot_env_bomb.axes.light:Light",
+        "lerobot_env_bomb.bomb.axes.light:Light",
     ),
     "language": Axis(
         "wording of the instruction; it stays unambiguous",
         ("instruction",),
         {"form": Magnitude("number", (1, 2, 3, 4, 5), "form of the instruction")},
-        "lerobot_env_bomb.axes.language:Wording",
+        "lerobot_env_bomb.bomb.axes.language:Wording",
     ),
     "dynamics": Axis(
         "mass and friction of the stones, noise and latency of the arm",
@@ -109,7 +109,7 @@ _OWN = {
             ),
             "latency": Magnitude("control steps", (0, 0, 0, 1, 1), "before an action is executed"),
         },
-        "lerobot_env_bomb.axes.dynamics:Dynamics",
+        "lerobot_env_bomb.bomb.axes.dynamics:Dynamics",
     ),
     "object": Axis(
         "size, shape and shade of the stones",
@@ -120,13 +120,13 @@ _OWN = {
             "shade": Magnitude("share", (0.06, 0.12, 0.19, 0.25, 0.32), "of the way to grey, both colours"),
             "flat": Magnitude("1 = yes", (0, 0, 1, 1, 1), "flat discs, not lens-shaped stones"),
         },
-        "lerobot_env_bomb.axes.object:StoneLook",
+        "lerobot_env_bomb.bomb.axes.object:StoneLook",
     ),
     "goal_marker": Axis(
         "a blue dot on the target",
         ("images",),
         {"radius": Magnitude("mm", (3, 4.5, 6, 8, 10), "of the dot")},
-        "lerobot_env_bomb.axes.goal_marker:GoalMarker",
+        "lerobot_env_bomb.bomb.axes.goal_marker:GoalMarker",
         is_help=True,
     ),
 }

@@ -84,13 +84,13 @@ def check_rendering() -> Iterator[Component]:
     # any of them may have loaded MuJoCo or OpenGL by the time that an environment draws
     importlib.import_module("lerobot.utils.import_utils").register_third_party_plugins()
     try:
-        backend = importlib.import_module("lerobot_env_mujoco.backend").ensure_gl_backend()
+        backend = importlib.import_module("lerobot_env_bomb.shared.backend").ensure_gl_backend()
     except (RuntimeError, ValueError) as error:
         yield Component("opengl", str(error), broken=True)
         return
     from lerobot_bomb.bomb.observation import PIXELS
 
-    env = importlib.import_module("lerobot_env_bomb.env").BombEnv()
+    env = importlib.import_module("lerobot_env_bomb.bomb.env").BombEnv()
     observation, _ = env.reset(seed=0)
     env.close()
     contrast = max(int(image.max()) - int(image.min()) for image in observation[PIXELS].values())
@@ -101,7 +101,7 @@ def check_rendering() -> Iterator[Component]:
 def check_fetch() -> Iterator[Component]:
     """Check that the arm from gymnasium-robotics can be used; the other one needs nothing."""
     try:
-        importlib.import_module("lerobot_env_bomb.fetch_files").fetch_xml()
+        importlib.import_module("lerobot_env_bomb.bomb.fetch_files").fetch_xml()
         yield Component("--env.robot=fetch", "can run")
     except ValueError as error:
         yield Component("--env.robot=fetch", str(error), absent=True)
@@ -109,7 +109,7 @@ def check_fetch() -> Iterator[Component]:
 
 def check_sapien() -> Iterator[Component]:
     """Check that the second simulator is installed, and that its renderer finds a driver."""
-    simulators = importlib.import_module("lerobot_env_bomb.simulators")
+    simulators = importlib.import_module("lerobot_env_bomb.bomb.simulators")
     checks = {
         "simulator": lambda: simulators.import_with_sapien("sapien_physics") and "can run",
         "render_preset": lambda: simulators.import_with_sapien("sapien_render").device_name(),

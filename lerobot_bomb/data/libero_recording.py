@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 
 # Importing the part before the colon registers the id; no module of the core imports an environment.
-ENV_ID = "lerobot_env_bomb_libero:bomb_libero/Libero-v0"
+ENV_ID = "lerobot_env_bomb:bomb_libero/Libero-v0"
 IMAGE_SIZE = ("observation_height", "observation_width")
 IMAGE_NAMES = ("image", "image2")  # of LeRobot's environment
 

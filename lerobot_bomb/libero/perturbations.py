@@ -18,7 +18,7 @@ _OWN = {
                 "share", (0.06, 0.12, 0.2, 0.3, 0.45), "contrast of stripes, checks or speckles"
             ),
         },
-        "lerobot_env_bomb_libero.axes.table:SurfaceLook",
+        "lerobot_env_bomb.libero.axes.table:SurfaceLook",
     ),
     "reflectance": Axis(
         "gloss of objects; lamps' reflections on table and floor",
@@ -31,13 +31,13 @@ _OWN = {
             ),
             "gloss": Magnitude("share", (0.1, 0.2, 0.3, 0.4, 0.5), "of the way to full specular light"),
         },
-        "lerobot_env_bomb_libero.axes.reflectance:LiberoGloss",
+        "lerobot_env_bomb.libero.axes.reflectance:LiberoGloss",
     ),
     "distractors": Axis(
         "boxes, cylinders and balls that stand beside the objects",
         ("images",),
         {"count": Magnitude("bodies", (1, 2, 3, 4, 5), "more in the scene")},
-        "lerobot_env_bomb_libero.axes.distractors:Distractors",
+        "lerobot_env_bomb.libero.axes.distractors:Distractors",
     ),
     "start": Axis(
         "where objects and the arm are at the start",
@@ -50,10 +50,10 @@ _OWN = {
                 "radians", (0.04, 0.08, 0.12, 0.16, 0.2), "of its joints, root of sum of squares"
             ),
         },
-        "lerobot_env_bomb_libero.axes.start:LiberoStart",
+        "lerobot_env_bomb.libero.axes.start:LiberoStart",
     ),
     "photometric": replace(
-        BOMB_AXES["photometric"], transform="lerobot_env_bomb_libero.axes.photometric:LiberoSensor"
+        BOMB_AXES["photometric"], transform="lerobot_env_bomb.libero.axes.photometric:LiberoSensor"
     ),
     "camera": Axis(
         "angle, field of view and distance of the cameras; what was in view stays in view",
@@ -66,11 +66,11 @@ _OWN = {
                 "share", (0.03, 0.06, 0.09, 0.12, 0.15), "further or nearer, the scene's camera"
             ),
         },
-        "lerobot_env_bomb_libero.axes.camera:LiberoCamera",
+        "lerobot_env_bomb.libero.axes.camera:LiberoCamera",
     ),
-    "light": replace(BOMB_AXES["light"], transform="lerobot_env_bomb_libero.axes.light:LiberoLight"),
+    "light": replace(BOMB_AXES["light"], transform="lerobot_env_bomb.libero.axes.light:LiberoLight"),
     "language": replace(
-        BOMB_AXES["language"], transform="lerobot_env_bomb_libero.axes.language:LiberoWording"
+        BOMB_AXES["language"], transform="lerobot_env_bomb.libero.axes.language:LiberoWording"
     ),
     "dynamics": Axis(
         "mass and friction of the objects, noise and latency of the arm",
@@ -83,7 +83,7 @@ _OWN = {
             ),
             "latency": Magnitude("control steps", (0, 0, 1, 1, 2), "before an action is executed"),
         },
-        "lerobot_env_bomb_libero.axes.dynamics:LiberoDynamics",
+        "lerobot_env_bomb.libero.axes.dynamics:LiberoDynamics",
     ),
     "object": Axis(
         "shade of the objects",
@@ -92,7 +92,7 @@ _OWN = {
             "shade": Magnitude("factor", (0.87, 0.75, 0.64, 0.55, 0.47), "of their colour"),
             "tint": Magnitude("share", (0.04, 0.08, 0.12, 0.16, 0.2), "less of one random channel"),
         },
-        "lerobot_env_bomb_libero.axes.object:ObjectShade",
+        "lerobot_env_bomb.libero.axes.object:ObjectShade",
     ),
 }
 LIBERO_AXES = axes_of("bomb_libero", _OWN)

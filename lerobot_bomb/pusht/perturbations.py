@@ -24,7 +24,7 @@ _OWN = {
                 "share", (0.05, 0.09, 0.13, 0.17, 0.21), "darkness of stripes, checks or speckles"
             ),
         },
-        "lerobot_env_bomb_pusht.axes.table:BoardLook",
+        "lerobot_env_bomb.pusht.axes.table:BoardLook",
     ),
     "start": Axis(
         "where block and agent are at the start",
@@ -34,12 +34,12 @@ _OWN = {
             "turn": Magnitude("degrees", (15, 30, 45, 60, 75), "of the block, to a random side"),
             "agent": Magnitude("pixels", (20, 40, 60, 80, 100), "of the agent, towards the board's middle"),
         },
-        "lerobot_env_bomb_pusht.axes.start:PushTStart",
+        "lerobot_env_bomb.pusht.axes.start:PushTStart",
     ),
     "photometric": replace(
-        BOMB_AXES["photometric"], transform="lerobot_env_bomb_pusht.axes.photometric:PushTSensor"
+        BOMB_AXES["photometric"], transform="lerobot_env_bomb.pusht.axes.photometric:PushTSensor"
     ),
-    "language": replace(BOMB_AXES["language"], transform="lerobot_env_bomb_pusht.axes.language:PushTWording"),
+    "language": replace(BOMB_AXES["language"], transform="lerobot_env_bomb.pusht.axes.language:PushTWording"),
     "dynamics": Axis(
         "damping and friction of the block, latency and noise of the agent",
         ("dynamics",),
@@ -51,13 +51,13 @@ _OWN = {
             "noise": Magnitude("pixels", (2, 4, 6, 8, 10), "standard deviation on the executed x and y"),
             "latency": Magnitude("control steps", (0, 0, 1, 1, 2), "before an action is executed"),
         },
-        "lerobot_env_bomb_pusht.axes.dynamics:PushTDynamics",
+        "lerobot_env_bomb.pusht.axes.dynamics:PushTDynamics",
     ),
     "object": Axis(
         "shade of the block",
         ("images",),
         {"shade": Magnitude("share", (0.2, 0.4, 0.6, 0.8, 1.0), "of the way to a random colour")},
-        "lerobot_env_bomb_pusht.axes.object:BlockShade",
+        "lerobot_env_bomb.pusht.axes.object:BlockShade",
     ),
     "goal": Axis(
         "where the target lies, which the instruction then says",
@@ -66,14 +66,14 @@ _OWN = {
             "shift": Magnitude("pixels", (16, 32, 48, 64, 80), "of the target, in a random direction"),
             "turn": Magnitude("degrees", (12, 24, 36, 48, 60), "of the target, to a random side"),
         },
-        "lerobot_env_bomb_pusht.axes.goal:GoalPose",
+        "lerobot_env_bomb.pusht.axes.goal:GoalPose",
     ),
     "goal_marker": Axis(
         "the target's outline in red over whatever lies on it",
         ("images",),
         # even steps in an image of 96 pixels
         {"width": Magnitude("pixels", (5, 10, 12, 20, 23), "of the line")},
-        "lerobot_env_bomb_pusht.axes.goal_marker:GoalOutline",
+        "lerobot_env_bomb.pusht.axes.goal_marker:GoalOutline",
         is_help=True,
     ),
 }

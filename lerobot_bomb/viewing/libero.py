@@ -6,7 +6,7 @@ import numpy as np
 from lerobot_bomb.libero.episode import LiberoSpec
 from lerobot_bomb.viewing.sheet import text_tile
 
-ENV_ID = "lerobot_env_bomb_libero:bomb_libero/Libero-v0"
+ENV_ID = "lerobot_env_bomb:bomb_libero/Libero-v0"
 ACTIONS = [[0.5, 0.0, -0.8, 0.0, 0.0, 0.0, -1.0]] * 12  # forwards and down
 
 

@@ -25,7 +25,7 @@ from lerobot_bomb.viewing.sheet import text_tile
 if TYPE_CHECKING:
     from lerobot_bomb.viewing.film import Shot
 
-ENV_ID = "lerobot_env_bomb_pusht:bomb_pusht/PushT-v0"
+ENV_ID = "lerobot_env_bomb:bomb_pusht/PushT-v0"
 COVERAGE_AT = 0.95  # of the image's height, where the coverage stands
 PUSHED_STEPS = 6  # through the block, to show what `dynamics` does
 

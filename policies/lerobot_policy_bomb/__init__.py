@@ -1,14 +1,16 @@
 """Entry point of the plugin: LeRobot imports it by name; it registers env types, policy types, processors."""
 
+# ruff: noqa: F401  importing registers
+
 import lerobot_bomb.explain.interventions
-import lerobot_env_bomb.configuration_bomb
-import lerobot_env_bomb_libero.configuration_bomb_libero
-import lerobot_env_bomb_pusht.configuration_bomb_pusht
-import lerobot_policy_bomb_expert
-import lerobot_policy_bomb_random
-import lerobot_policy_fdvla
-import lerobot_policy_spatialvla_grid
-import lerobot_policy_vla0_smol
+import lerobot_env_bomb.bomb.configuration_bomb
+import lerobot_env_bomb.libero.configuration_bomb_libero
+import lerobot_env_bomb.pusht.configuration_bomb_pusht
+import lerobot_policy_bomb.bomb_expert
+import lerobot_policy_bomb.bomb_random
+import lerobot_policy_bomb.fdvla
+import lerobot_policy_bomb.spatialvla_grid
+import lerobot_policy_bomb.vla0_smol
 from lerobot_bomb.checkpoints.config import config_damage
 from lerobot_bomb.checkpoints.environment import complete_evaluation
 from lerobot_bomb.checkpoints.names import is_hub_id
@@ -29,22 +31,11 @@ from lerobot_bomb.data.missing import describe_missing_dataset
 from lerobot_bomb.flag_errors import hint, refuse_unknown
 from lerobot_bomb.results.names import SHIPPED_PREFIX
 
-OURS = (
-    lerobot_bomb,
-    lerobot_env_bomb,
-    lerobot_env_bomb_libero,
-    lerobot_env_bomb_pusht,
-    lerobot_policy_bomb_expert,
-    lerobot_policy_bomb_random,
-    lerobot_policy_fdvla,
-    lerobot_policy_spatialvla_grid,
-    lerobot_policy_vla0_smol,
-)
-SHARED = "lerobot_env_mujoco"  # our package with which environments draw; it has no type
+OURS = ("lerobot_bomb", "lerobot_env_bomb", "lerobot_policy_bomb")
 
 resolve_checkpoints(SHIPPED_PREFIX, checkpoint_path)
 register(
-    [*(package.__name__ for package in OURS), SHARED],
+    OURS,
     [
         remember_policies,
         check_saved_processors,

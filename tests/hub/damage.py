@@ -10,7 +10,7 @@ from fdvla_cases import make_policy as make_fdvla
 from safetensors.torch import load_file, save_file
 from vla0_smol_cases import STATS, make_policy
 
-from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
+from lerobot_policy_bomb.vla0_smol import make_vla0_smol_pre_post_processors
 
 type Damage = Callable[[Path], None]
 type Tensors = dict[str, torch.Tensor]

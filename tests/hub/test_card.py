@@ -19,9 +19,9 @@ from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.hub.card import Checkpoint, PolicyCard
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.reading import parse_record
-from lerobot_policy_fdvla.card_fdvla import METHOD as FDVLA
-from lerobot_policy_spatialvla_grid.card_spatialvla_grid import METHOD as GRID
-from lerobot_policy_vla0_smol.card_vla0_smol import METHOD as VLA0
+from lerobot_policy_bomb.fdvla.card_fdvla import METHOD as FDVLA
+from lerobot_policy_bomb.spatialvla_grid.card_spatialvla_grid import METHOD as GRID
+from lerobot_policy_bomb.vla0_smol.card_vla0_smol import METHOD as VLA0
 
 HUB_NAME = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
 INFO = {"total_episodes": 3, "total_frames": 60, "fps": 10}

@@ -38,7 +38,7 @@ from lerobot_bomb.checkpoints.adapters import check_adapters
 from lerobot_bomb.checkpoints.folder import load_processors, read_config
 from lerobot_bomb.compat.use import use
 from lerobot_bomb.explain.interventions import intervene
-from lerobot_policy_vla0_smol import Vla0SmolConfig
+from lerobot_policy_bomb.vla0_smol import Vla0SmolConfig
 
 UNNORMALIZER = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
 NAN = torch.tensor([float("nan"), 1.0, 1.0, 1.0])

@@ -36,7 +36,7 @@ from lerobot_bomb.commands.main import main
 from lerobot_bomb.hub.rates import FIGURE
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.origin import PolicyIdentity
-from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 REPO_ID = "me/x"
 

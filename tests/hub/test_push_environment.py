@@ -28,7 +28,7 @@ assert list(envs) == ["goal.none", "goal.camera-3"] and [*envs["goal.none"]] == 
 env = envs["goal.camera-3"][2]
 observation, _ = env.reset(seed=[1000, 1001])
 assert observation["pixels"]["wrist"].shape == (2, 64, 64, 3)
-from lerobot_env_bomb.configuration_bomb import BombEnvConfig
+from lerobot_env_bomb.bomb.configuration_bomb import BombEnvConfig
 config = BombEnvConfig(task="goal", perturbations=["camera:3"], task_ids=[2], image_size=64)
 same = config.create_envs(2)["goal.camera-3"][2].reset(seed=[1000, 1001])[0]
 assert (observation["pixels"]["wrist"] == same["pixels"]["wrist"]).all()
