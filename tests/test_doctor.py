@@ -2,7 +2,6 @@ import importlib.metadata
 import os
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -60,10 +59,14 @@ def test_a_policy_that_cannot_be_imported_is_shown_with_its_cause(
     assert "import of lerobot_policy_bomb.fdvla halted" in output
 
 
-def test_a_package_that_registers_no_type_of_its_name_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_that_registers_no_type_of_its_name_is_broken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "nothing").mkdir()
+    (tmp_path / "nothing" / "__init__.py").touch()
     plugin = importlib.import_module(doctor.DISTRIBUTION)
-    for name in ("lerobot_policy_nothing", "lerobot_env_nothing"):
-        monkeypatch.setattr(plugin, name, ModuleType(name), raising=False)
+    monkeypatch.setattr(plugin, "__path__", [*plugin.__path__, str(tmp_path)])
+    monkeypatch.setattr(doctor, "ENVIRONMENTS", ("bomb", "nothing"))
     broken = [finding for finding in doctor.check_types() if finding.broken]
     assert [(finding.name, finding.detail) for finding in broken] == [
         ("--env.type=nothing", "not registered"),

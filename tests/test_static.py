@@ -85,7 +85,7 @@ def test_a_reader_of_scene_and_sentence_acts_as_its_label(suite: str) -> None:
             read = expert_action(replace(view.state, goals=goals_of_reader(view)))
             np.testing.assert_allclose(read, expert_action(moment.state), atol=0.02, err_msg=view.text)
             numbers_held.add(view.held is not None)
-            numbers_made.add(env._run.num_made)
+            numbers_made.add(env._run.judge.num_made)
     assert numbers_held == {True, False}
     assert (len(numbers_made) > 1) == (suite in ("goal", "long"))
 

@@ -11,7 +11,7 @@ import platform
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from types import ModuleType
+from pkgutil import iter_modules
 
 from packaging.requirements import Requirement
 
@@ -20,8 +20,6 @@ from lerobot_bomb.environments import ENVIRONMENTS
 from lerobot_bomb.libero.assets import INSTALL, SUITES, Libero, describe_missing_assets
 
 DISTRIBUTION = "lerobot_policy_bomb"
-# prefixes of the packages that register a type each
-ENV_PREFIX, POLICY_PREFIX = "lerobot_env_", "lerobot_policy_"
 DEPENDENCIES = (
     "lerobot",
     "torch",
@@ -153,18 +151,13 @@ def check_types() -> Iterator[Component]:
     from lerobot.envs import EnvConfig
     from lerobot.policies.factory import get_policy_class
 
-    for name in dict.fromkeys([*_imported_types(plugin, ENV_PREFIX), *ENVIRONMENTS]):
+    for name in ENVIRONMENTS:
         known = name in EnvConfig.get_known_choices()
         yield Component(f"--env.type={name}", "registered" if known else "not registered", broken=not known)
-    for name in _imported_types(plugin, POLICY_PREFIX):
+    for name in (module.name for module in iter_modules(plugin.__path__) if module.ispkg):
         known = name in PreTrainedConfig.get_known_choices()
         detail = get_policy_class(name).__name__ if known else "not registered"
         yield Component(f"--policy.type={name}", detail, broken=not known)
-
-
-def _imported_types(plugin: ModuleType, prefix: str) -> list[str]:
-    """Return the type of each package with this prefix that a module imports: act of lerobot_policy_act."""
-    return [name.removeprefix(prefix) for name in vars(plugin) if name.startswith(prefix)]
 
 
 def check_gpu() -> Iterator[Component]:
