@@ -21,7 +21,7 @@ def main() -> None:
     """Print {"seconds": ...} as the last line."""
     path = sys.argv[1]
     config = BombEnvConfig(simulator="sapien" if path == "sapien" else "mujoco")
-    create_envs = EnvConfig.create_envs if path == "default" else BombEnvConfig.create_envs
+    create_envs = {"default": EnvConfig.create_envs}.get(path, BombEnvConfig.create_envs)
     started = time.perf_counter()
     suites = create_envs(config, NUM_ENVS, use_async_envs=True)
     env = next(iter(next(iter(suites.values())).values()))

@@ -67,7 +67,7 @@ def floors_of_places(suite: str, seeds: Sequence[int]) -> Floors:
             sum(1 / len(legal(episode, stone)) for stone in episode.supply) / num_stones**2
         )
         chances["no colours"].append(
-            float(answer_without_colours(episode, rng) == (episode.stone, episode.target))
+            float(answer_without_colours(episode, rng) == (episode.aims[0].stone, episode.target))
         )
     return {name: float(np.mean(values)) for name, values in chances.items()}
 
@@ -137,8 +137,8 @@ def answer_without_colours(episode: Episode, rng: np.random.Generator) -> tuple[
         place = None
         while place is None:
             place = task.select(recoloured(episode.opening, rng), COLORS[1 - COLORS.index(color)])
-        return episode.stone, place
-    return episode.stone, episode.target  # one stone, whose place is named by numbers
+        return episode.aims[0].stone, place
+    return episode.aims[0].stone, episode.target  # one stone, whose place is named by numbers
 
 
 def recoloured(opening: Stones, rng: np.random.Generator) -> dict[Intersection, str]:

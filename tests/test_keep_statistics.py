@@ -90,7 +90,8 @@ def test_units_are_those_of_the_processors(
     relative = {} if policy_type == "spatialvla_grid" else {"relative_actions": True}
     config = CASES[policy_type].make_config(**POINTING[policy_type] | relative)
     old: Any = make_policy(config, ds_meta=first.meta)
-    made = make_pre_post_processors(config, dataset_stats=first.meta.stats)
+    statistics: Any = first.meta.stats
+    made = make_pre_post_processors(config, dataset_stats=statistics)
     for part in (old, *made):
         part.save_pretrained(tmp_path)
     raw = default_collate([second[i] for i in (2, 5)])

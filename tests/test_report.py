@@ -292,6 +292,7 @@ def test_points_as_numbers() -> None:
         {"none": [(read(values(seed, "dropped")), read(values(seed))) for seed in range(6)]}
     )
     difference, p_value = points(compared)
+    assert compared.interval is not None
     low, high = compared.interval
     counts = {"both": 0, "only_first": 0, "only_second": 6, "neither": 0}
     assert difference.value == {"difference": 1, "low": low, "high": high, **counts}

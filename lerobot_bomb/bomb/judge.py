@@ -144,12 +144,12 @@ class Judge:
 
     def _course(self, plan: Plan, made: Made) -> Course:
         """Return how far a plan has come, by what lies in place and what the fingers carry."""
-        is_held, lying = self._now.stone_touched.all(axis=1), dict(made)
+        held, lying = set(np.flatnonzero(self._now.stone_touched.all(axis=1)).tolist()), dict(made)
         for number, move in open_moves(plan, lying):  # a move that lies in place opens later ones
             in_place = (
                 (stone, place)
                 for stone in sorted(stones_left(move, lying))
-                if self._is_flat(stone) and not is_held[stone]
+                if self._is_flat(stone) and stone not in held
                 for place in self._places_under(stone, move, lying)
             )
             if (found := next(in_place, None)) is not None:
@@ -158,7 +158,7 @@ class Judge:
             (number, stone)
             for number, move in open_moves(plan, lying)
             for stone in sorted(stones_left(move, lying))
-            if is_held[stone] or self._was_lifted[stone]
+            if stone in held or self._was_lifted[stone]
         )
         return Course(plan, made, lying, next(carried, None))
 

@@ -1,7 +1,7 @@
 """Episodes as LeRobot's eval_info.json with seeds, for tools that pair the episodes of two policies."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 from lerobot_bomb.results.groups import Group, by_condition, by_task, condition_key, rate_of
@@ -26,7 +26,7 @@ def eval_info_files(groups: Iterable[Group]) -> dict[str, str]:
     return files
 
 
-def _eval_info(records: Sequence[Record]) -> dict[str, Any]:
+def _eval_info(records: list[Record]) -> dict[str, Any]:
     episodes = [
         {
             "episode_ix": number,
