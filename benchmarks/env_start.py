@@ -9,6 +9,7 @@ imports of the main script in every child unless somebody prevents it.
 import json
 import sys
 import time
+from typing import Any
 
 from lerobot.envs import EnvConfig
 
@@ -23,7 +24,7 @@ def main() -> None:
     config = BombEnvConfig(simulator="sapien" if path == "sapien" else "mujoco")
     create_envs = {"default": EnvConfig.create_envs}.get(path, BombEnvConfig.create_envs)
     started = time.perf_counter()
-    suites = create_envs(config, NUM_ENVS, use_async_envs=True)
+    suites: Any = create_envs(config, NUM_ENVS, use_async_envs=True)
     env = next(iter(next(iter(suites.values())).values()))
     env.reset(seed=list(range(NUM_ENVS)))
     seconds = time.perf_counter() - started
