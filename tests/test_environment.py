@@ -87,6 +87,18 @@ def test_suite_and_tasks_are_those_of_the_recording_or_of_its_episodes_or_unknow
         assert facts.seeds == seeds
 
 
+@pytest.mark.parametrize(("is_told", "seeds"), [(True, [3, 4, 5, 90]), (False, None)])
+def test_static_scenes_have_a_seed_a_frame(is_told: bool, seeds: list[int] | None, tmp_path: Path) -> None:
+    root = write_dataset(tmp_path, None, None)
+    features = {**INFO["features"], "next.done": {"dtype": "bool", "shape": [1]}}
+    (root / "meta" / "info.json").write_text(json.dumps({**INFO, "features": features}))
+    columns: dict[str, Any] = {"length": [3, 9], "bomb/spec": [spec("place", 3), spec("place", 90)]}
+    if is_told:
+        columns["stats/next.done/min"] = [[1.0], [0.0]]
+    pq.write_table(pa.table(columns), root / "meta" / "episodes" / "file-000.parquet")
+    assert DatasetFacts.read(root).seeds == seeds
+
+
 @pytest.mark.parametrize(
     "change",
     [

@@ -108,7 +108,9 @@ def test_a_merge_that_loses_episodes_is_an_error_and_the_blocks_stay(
     monkeypatch.setattr(
         blocks, "merge_blocks", lambda layout, folders, root: merge(layout, folders[:-1], root)
     )
-    with pytest.raises(RuntimeError, match=r"holds 4 episodes, but 5 were made; 5 episodes are kept"):
+    with pytest.raises(
+        RuntimeError, match=r"holds 4 episodes, but meta/bomb.json says that 5 were made; 5 episodes are kept"
+    ):
         record(RECORDING, tmp_path / "x", resume=True)
     assert not (tmp_path / "x").exists()
 

@@ -283,6 +283,33 @@ def test_what_was_trained_on_validates_only_when_named_and_with_a_warning(
     assert "warning: 1 of the 2 validation episodes were trained on" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("is_there", "warnings"),
+    [
+        (True, ["warning: 2 of the 3 validation"]),
+        (False, ["warning: not every training", "warning: 1 of the 3 validation"]),
+    ],
+)
+def test_what_its_parent_was_trained_on_counts(
+    is_there: bool,
+    warnings: list[str],
+    checkpoint: Path,
+    root: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    parent = checkpoint if is_there else tmp_path / "gone"
+    more = {"pretrained_path": str(parent), "trained_batches": 2}
+    path = edited(checkpoint, tmp_path / "child", lambda config: config.update(more))
+    training = json.loads((path / "train_config.json").read_text())
+    training["dataset"]["episodes"] = [2]
+    (path / "train_config.json").write_text(json.dumps(training))
+    flags = [f"--policy.path={path}", f"--dataset.repo_id={REPO_ID}", f"--dataset.root={root}"]
+    assert main(["checkpoint", "offline-metrics", *flags, "--val_episodes=1-3", "--max_frames=1"]) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
+    assert [line[: len(start)] for line, start in zip(told, warnings, strict=True)] == warnings
+
+
 def test_a_checkpoint_that_does_not_say_what_it_saw_needs_the_flag(
     checkpoint: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,9 +9,11 @@ import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.aggregate import aggregate_datasets
+from lerobot.utils.constants import ACTION, OBS_STATE
 from small_datasets import write_dataset
 
 from lerobot_bomb.commands.main import main
+from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode, write_block
 
 REPO_ID = "test/merged"
 
@@ -69,3 +71,29 @@ def test_what_cannot_be_merged_is_refused(
         assert merge(given, tmp_path / root) == 1
         assert message in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["other"]
+
+
+def write_bomb(root: Path, actions: list[float]) -> Path:
+    """Write an episode for each action, all of one spec."""
+    column = {"dtype": "float32", "shape": (1,), "names": ["x"]}
+    layout = DatasetLayout(REPO_ID, 10, "scara", {OBS_STATE: column, ACTION: column}, use_videos=False)
+    frames = [{OBS_STATE: np.ones(1, np.float32), ACTION: np.float32([x]), "task": "go"} for x in actions]
+    write_block(layout, root, [RecordedEpisode([frame], {"bomb/spec": '{"seed": 0}'}) for frame in frames])
+    return root
+
+
+def test_episodes_are_merged_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = write_bomb(tmp_path / "first", [1.0]), write_bomb(tmp_path / "second", [2.0])
+    assert merge([first, second], tmp_path / "both") == 0  # one seed, run by two policies
+    again = tmp_path / "both" / ".." / "first"
+    refused = {
+        f"{first} and {again} are one dataset": [first, again],
+        f"{second} and {tmp_path / 'both'} both hold episode 1 of {tmp_path / 'both'}": [
+            second,
+            tmp_path / "both",
+        ],
+    }
+    for message, given in refused.items():
+        assert merge(given, tmp_path / "new") == 1
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()

@@ -1,5 +1,6 @@
 """Training of a checkpoint, as its files describe it."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ def read_train_config(checkpoint: Path) -> dict[str, Any]:
     return read_json(path) if path.is_file() else {}
 
 
-def dataset_of(train_config: dict[str, Any]) -> Path | None:
+def dataset_of(train_config: Mapping[str, Any]) -> Path | None:
     """Return the folder of the training's dataset, which may be gone; None if unknown.
 
     Raises:

@@ -2,13 +2,12 @@
 
 import argparse
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE
-from lerobot_bomb.checkpoints.training import dataset_of, read_train_config, trained_image_size
+from lerobot_bomb.checkpoints.training import trained_image_size
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO, check_at_least, checkpoint_flag, path_flag
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.files import written_whole
@@ -67,7 +66,9 @@ def run(args: argparse.Namespace) -> int:
     check_flags([flag for flag in args.rest if not flag.startswith("--env.task=")])
     groups = _run_jobs(args, args.folder / "first", _first_groups(args))
     groups |= _run_jobs(args, args.folder / "second", _second_groups(args, groups[POLICY]))
-    found = judge(groups, _trained_seeds(args.policy_path))
+    from lerobot_bomb.hub.history import History  # LeRobot: seconds
+
+    found = judge(groups, History.read(args.policy_path).seeds)
     section = Section("Audit", verdicts.verdict_tables(groups, found))
     html, tables = (args.folder / f"audit{suffix}" for suffix in (".html", ".json"))
     with written_whole(html, tables) as (page, as_json):
@@ -146,10 +147,3 @@ def _run_jobs(args: argparse.Namespace, folder: Path, jobs: dict[str, Job]) -> d
     if missing:
         raise RuntimeError("\n".join([f"no records of: {', '.join(missing)}", *store.lines()]))
     return {name: read_results(store.file(job, "jsonl")) for name, job in jobs.items()}
-
-
-def _trained_seeds(checkpoint: Path) -> Sequence[int] | None:
-    from lerobot_bomb.data.facts import DatasetFacts  # pyarrow and PyAV
-
-    facts = DatasetFacts.find(dataset_of(read_train_config(checkpoint)))
-    return None if facts is None else facts.seeds

@@ -4,6 +4,7 @@ import argparse
 import json
 import sys
 from dataclasses import asdict
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from lerobot_bomb.checkpoints.training import read_train_config
@@ -79,6 +80,7 @@ def _check_flags(args: argparse.Namespace) -> None:
 
 def _split(args: argparse.Namespace, meta: "LeRobotDatasetMetadata", train_config: dict[str, Any]) -> "Split":
     from lerobot_bomb.evaluation.splits import make_split, parse_episodes, trained_episodes
+    from lerobot_bomb.hub.history import History
 
     if not train_config and args.val_episodes is None:
         raise ValueError(
@@ -89,7 +91,15 @@ def _split(args: argparse.Namespace, meta: "LeRobotDatasetMetadata", train_confi
         None if text is None else parse_episodes(flag, text, meta.total_episodes)
         for flag, text in (("--train_episodes", args.train_episodes), ("--val_episodes", args.val_episodes))
     )
-    split = make_split(meta.total_episodes, trained_episodes(train_config, meta), train, validation)
+    history = History.read(args.policy_path)
+    if not history.is_whole:
+        print(
+            "warning: not every training of the checkpoint is known, so validation episodes may have been "
+            "trained on",
+            file=sys.stderr,
+        )
+    trained = chain(*(trained_episodes(each.train_config, meta) or [] for each in history.trainings))
+    split = make_split(meta.total_episodes, sorted(set(trained)), train, validation)
     if split.seen:
         print(
             f"warning: {len(split.seen)} of the {len(split.validation)} validation episodes were trained on",

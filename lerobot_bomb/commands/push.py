@@ -93,7 +93,7 @@ def _push_checkpoint(args: argparse.Namespace) -> int:
         )
     from lerobot_bomb.checkpoints.checks import checkpoint_files  # imports torch: seconds
     from lerobot_bomb.data.facts import DatasetFacts
-    from lerobot_bomb.hub.evaluated import check_environment_of, check_weights_of
+    from lerobot_bomb.hub.evaluated import check_environment_of, check_policy_of
     from lerobot_bomb.hub.push import publish, read_checkpoint
     from lerobot_bomb.hub.rates import FIGURE
     from lerobot_bomb.hub.upload import check_token
@@ -101,7 +101,7 @@ def _push_checkpoint(args: argparse.Namespace) -> int:
     dataset = None if args.dataset_root is None else DatasetFacts.read(args.dataset_root)
     files = {name: args.folder / name for name in checkpoint_files(args.folder)}
     for path, rows in zip(args.results, results, strict=True):
-        check_weights_of(path, rows, args.folder)
+        check_policy_of(path, rows, args.folder)
     if (args.folder / TRAIN_CONFIG).is_file():
         files[TRAIN_CONFIG] = args.folder / TRAIN_CONFIG
     if not args.dry_run:

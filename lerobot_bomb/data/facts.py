@@ -1,7 +1,7 @@
 """Facts about a dataset from its folder, and the flags that evaluate in its environment."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,10 @@ from lerobot_bomb.results.libero import LiberoResult
 
 PUSHT_SOURCE = "pusht-zarr"
 LIBERO_SOURCE = "libero-hdf5"
-SPEC_COLUMN = "bomb/spec"  # of LeRobot's table of episodes
+DONE = "next.done"  # as in LeRobot's constants, whose import takes seconds
+# columns of LeRobot's table of episodes
+SPEC_COLUMN = "bomb/spec"
+LEAST_DONE = f"stats/{DONE}/min"  # 1: every frame is the last one of its own
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class DatasetFacts:
 
     info: dict[str, Any]
     bomb: dict[str, Any]  # {} = written or edited by others
-    # `EpisodeSpec` of each episode as JSON, read where bomb.json is gone; None: an episode has none
+    # `EpisodeSpec` of each episode and static scene as JSON, read where bomb.json is gone; None: one has none
     specs: Sequence[dict[str, Any]] | None = None
 
     @classmethod
@@ -45,7 +48,7 @@ class DatasetFacts:
         if path.is_file():
             return cls(info, read_json(path))
         is_bomb = Environment.of_dataset(info, None, None) is not None
-        return cls(info, {}, _read_specs(root) if is_bomb else None)
+        return cls(info, {}, _read_specs(root, info) if is_bomb else None)
 
     @classmethod
     def find(cls, root: Path | str | None) -> "DatasetFacts | None":
@@ -162,14 +165,23 @@ class DatasetFacts:
         ]
 
 
-def _read_specs(root: Path) -> list[dict[str, Any]] | None:
-    """Return `EpisodeSpec` of each episode as JSON; None if not every episode has one.
+def _read_specs(root: Path, info: Mapping[str, Any]) -> list[dict[str, Any]] | None:
+    """Return `EpisodeSpec` of each episode, and of each static scene, as JSON; None if one has none.
+
+    Static scenes are stored as an episode, a frame each, which is the last one of its own: their seeds count
+    up from the one that is stored.
 
     Raises:
         ValueError: a table of episodes is truncated.
     """
     tables = [read_parquet(path) for path in sorted((root / EPISODES_FOLDER).rglob("*.parquet"))]
-    if not tables or any(SPEC_COLUMN not in table.column_names for table in tables):
+    names = [SPEC_COLUMN, "length", *([LEAST_DONE] if DONE in info["features"] else [])]
+    if not tables or any(not set(names) <= set(table.column_names) for table in tables):
         return None
-    texts = [text for table in tables for text in table[SPEC_COLUMN].to_pylist()]
-    return None if None in texts else [json.loads(text) for text in texts]
+    specs = []
+    for row in (row for table in tables for row in table.select(names).to_pylist()):
+        if row[SPEC_COLUMN] is None:
+            return None
+        spec, num_scenes = json.loads(row[SPEC_COLUMN]), row["length"] if row.get(LEAST_DONE) == [1.0] else 1
+        specs += [{**spec, "seed": spec["seed"] + i} for i in range(num_scenes)]
+    return specs

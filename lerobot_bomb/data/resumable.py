@@ -228,19 +228,27 @@ def _read_whole(dataset: Path) -> Progress:
     Raises:
         RuntimeError: names the file that is damaged, or what differs.
     """
-    from lerobot_bomb.data.dataset_files import check_dataset, read_info
+    from lerobot_bomb.data.dataset_files import check_dataset
 
-    progress = read_progress(dataset / METADATA_FILE)
     try:
         check_dataset(dataset)
-        info = read_info(dataset)
+        check_counts(dataset)
     except ValueError as error:
         raise RuntimeError(str(error)) from error
+    return read_progress(dataset / METADATA_FILE)
+
+
+def check_counts(dataset: Path) -> None:
+    """Raise a ValueError if a dataset holds another number of episodes or frames than was made."""
+    from lerobot_bomb.data.dataset_files import read_info
+
+    progress, info = read_progress(dataset / METADATA_FILE), read_info(dataset)
     for name in ("episodes", "frames"):
         made, found = getattr(progress, f"num_{name}"), info[f"total_{name}"]
         if made != found:
-            raise RuntimeError(f"{dataset} holds {found} {name}, but {made} were made")
-    return progress
+            raise ValueError(
+                f"{dataset} holds {found} {name}, but {METADATA_FILE} says that {made} were made"
+            )
 
 
 def _keep_finished(folder: Path, parts: Sequence[Path]) -> str:

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,7 +39,7 @@ def parse_episodes(flag: str, text: str, num_episodes: int) -> list[int]:
     return sorted(episodes)
 
 
-def trained_episodes(train_config: dict[str, Any], meta: LeRobotDatasetMetadata) -> list[int] | None:
+def trained_episodes(train_config: Mapping[str, Any], meta: LeRobotDatasetMetadata) -> list[int] | None:
     """Episodes of this dataset that lerobot-train trained on; None if it trained on another dataset.
 
     With `dataset.eval_split` LeRobot holds out the last episodes of every task.

@@ -12,6 +12,7 @@ from huggingface_hub.errors import RevisionNotFoundError
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.data.dataset_files import check_dataset
 from lerobot_bomb.data.facts import DatasetFacts
+from lerobot_bomb.data.resumable import check_counts
 from lerobot_bomb.data.statistics import check_statistics
 from lerobot_bomb.data.unfinished import METADATA_FILE
 from lerobot_bomb.hub.markdown import code, command, fenced, plain
@@ -52,7 +53,7 @@ def read_dataset(root: Path, repo_id: str) -> RecordedDataset:
     """Read and check the dataset in a folder.
 
     Raises:
-        ValueError: the dataset is damaged, or lerobot-bomb did not write it.
+        ValueError: the dataset is damaged, or lerobot-bomb did not write it, or not all of it.
     """
     facts = DatasetFacts.read(root)
     if not facts.bomb:
@@ -61,6 +62,7 @@ def read_dataset(root: Path, repo_id: str) -> RecordedDataset:
             "LeRobotDataset.push_to_hub publishes other datasets"
         )
     check_dataset(root)
+    check_counts(root)
     check_statistics(root)
     files = {
         path.relative_to(root).as_posix(): path

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -61,9 +62,21 @@ class History:
 
     @classmethod
     def of(cls, config: Any, train_config: Mapping[str, Any], facts: DatasetFacts | None) -> "History":
-        """Follow the parents that configs name, while they are on this machine."""
-        trainings = [Training(getattr(config, "trained_batches", 0), train_config, facts)]
-        path, revision = config.pretrained_path, config.pretrained_revision
+        """Follow the parents that a config names, while they are on this machine."""
+        last = Training(getattr(config, "trained_batches", 0), train_config, facts)
+        return cls._follow(last, config.pretrained_path, config.pretrained_revision)
+
+    @classmethod
+    def read(cls, folder: Path) -> "History":
+        """Read the history of a checkpoint's folder, and follow its parents likewise."""
+        values, train_config = read_json(folder / CONFIG), read_train_config(folder)
+        facts = DatasetFacts.find(dataset_of(train_config))
+        last = Training(values.get("trained_batches", 0), train_config, facts)
+        return cls._follow(last, values.get("pretrained_path"), values.get("pretrained_revision"))
+
+    @classmethod
+    def _follow(cls, last: Training, path: Any, revision: str | None) -> "History":
+        trainings = [last]
         while path and (folder := _folder(str(path), revision)):
             values = read_json(folder / CONFIG)
             number = values.get("trained_batches", 0)
@@ -90,8 +103,19 @@ class History:
     @property
     def showed_only_nominal(self) -> bool:
         """Return True if every training is known, and none showed perturbed scenes."""
-        is_known = self._unknown_until is None
-        return is_known and all(each.perturbations == ["none"] for each in self.trainings)
+        return self.is_whole and all(each.perturbations == ["none"] for each in self.trainings)
+
+    @property
+    def is_whole(self) -> bool:
+        """Return True if no training is unknown."""
+        return self._unknown_until is None and all(each.train_config for each in self.trainings)
+
+    @property
+    def seeds(self) -> list[int] | None:
+        """Seeds that the trainings' datasets show, sorted; None if those of one are unknown."""
+        found = [None if each.facts is None else each.facts.seeds for each in self.trainings]
+        known = [seeds for seeds in found if seeds is not None]
+        return sorted(set(chain(*known))) if self.is_whole and len(known) == len(found) else None
 
     @property
     def _unknown_until(self) -> str | None:

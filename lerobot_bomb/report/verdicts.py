@@ -123,7 +123,7 @@ def _generalises(train: list[Record], heldout: list[Record]) -> Verdict:
 def _new_seeds(records: list[Record], trained: Sequence[int] | None) -> Verdict:
     question = "evaluates only episodes outside the training"
     if trained is None:
-        return Verdict(question, OPEN, "the dataset of the training is not here, or does not say its seeds")
+        return Verdict(question, OPEN, "a training or its dataset is not here, or does not say its seeds")
     seen = sorted({each.spec.seed for each in records} & set(trained))
     evidence = f"trained on seeds {trained[0]}..{trained[-1]}"
     return Verdict(question, NO if seen else YES, f"{evidence}{f', {len(seen)} evaluated' if seen else ''}")

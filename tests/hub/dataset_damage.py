@@ -96,6 +96,13 @@ DATASET_DAMAGES: dict[str, Damage] = {
     f"{INFO} does not say total_episodes": change_json(INFO, lambda i: i.update(total_episodes="2")),
     "meta/info.json says 2 of 1;": change_json(INFO, lambda i: i.update(total_frames=1)),
     "episodes do not follow one another in": change_json(INFO, lambda i: i.update(fps=20)),
+    # as after LeRobotDataset.resume, which appends in place
+    "holds 2 episodes, but meta/bomb.json says that 1 were made": change_json(
+        "meta/bomb.json", lambda b: b.update(num_episodes=1)
+    ),
+    "frames, but meta/bomb.json says that 1 were made": change_json(
+        "meta/bomb.json", lambda b: b.update(num_frames=1)
+    ),
     "so lerobot-bomb did not write it": remove("meta/bomb.json"),
     "so it is no LeRobotDataset": remove(INFO),
 }

@@ -121,3 +121,25 @@ def test_what_the_dataset_shows() -> None:
     (row,) = rows(History.of(config(7), train_config(7), facts))
     assert row[1] == "`me/d`, a name on the machine of the training: 3 episodes, 60 frames at 10 Hz"
     assert row[2] == r"camera:2\|x\`"
+
+
+def write_data(root: Path, seed: int) -> dict[str, str]:
+    """Write what a recording of two seeds says; return a training's `dataset`."""
+    (root / "meta").mkdir(parents=True)
+    (root / "meta" / "info.json").write_text(json.dumps(INFO))
+    recording = {"task": "place", "task_ids": [], "perturbations": ["none"], "seed": seed}
+    bomb = {"recording": recording, "num_episodes": 2, "num_frames": 60, "failures": []}
+    (root / "meta" / "bomb.json").write_text(json.dumps(bomb))
+    return {"repo_id": "me/d", "root": str(root)}
+
+
+def test_seeds_are_those_of_all_trainings(tmp_path: Path) -> None:
+    first = write_parent(tmp_path / "first", 10, 10)
+    second = write_parent(tmp_path / "second", 30, 20, parent=first)
+    assert History.read(second).is_whole and History.read(second).seeds is None  # the data are gone
+    for folder, steps, seed in ((first, 10, 3), (second, 20, 90)):
+        told = {**train_config(steps), "dataset": write_data(tmp_path / f"data{seed}", seed)}
+        (folder / "train_config.json").write_text(json.dumps(told))
+    assert History.read(second).seeds == [3, 4, 90, 91]
+    (first / "config.json").unlink()
+    assert not History.read(second).is_whole and History.read(second).seeds is None

@@ -1,9 +1,11 @@
 """`lerobot-bomb push`: what is published, what is refused, and what a push that is cut off leaves."""
 
+import gzip
 import hashlib
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -32,9 +34,15 @@ from hub.server import TOKEN, LoopbackHub
 from lerobot_bomb.bomb.board import task_id
 from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.checkpoints.folder import read_config
+from lerobot_bomb.checkpoints.identity import identity_of, identity_of_config, sha256_of
+from lerobot_bomb.checkpoints.names import BLANK_IMAGES
+from lerobot_bomb.checkpoints.shipped import shipped_checkpoint
 from lerobot_bomb.commands.main import main
+from lerobot_bomb.hub.evaluated import check_policy_of
 from lerobot_bomb.hub.rates import FIGURE
 from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
@@ -141,13 +149,40 @@ def test_results_of_other_weights_are_refused(
         assert error.count("\n") == 1
     assert online.requests == []
     results.write_text(
-        result(0, is_success=True, policy=PolicyIdentity("vla0_smol", str(tmp_path), None, ours, "b" * 64))
+        result(0, is_success=True, policy=PolicyIdentity("vla0_smol", str(tmp_path), None, ours))
     )
     assert push(checkpoint, "--dry_run", "--results", str(results)) == 0
     card = capsys.readouterr().out
     assert "| perturbations=none | 1/1 = 100.0 % [20.7, 100.0] |" in card
     assert "target drawn; colour drawn; protocol 1.1, suite=place" in card
     assert str(tmp_path) not in card
+
+
+@pytest.mark.parametrize("change", [{"settings_sha256": "b" * 64}, {"interventions": (BLANK_IMAGES,)}])
+def test_results_with_other_settings_are_refused(
+    change: dict[str, Any], checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = read_config(checkpoint, None)
+    as_read = identity_of_config(config)
+    as_built = identity_of(Vla0SmolPolicy.from_pretrained(checkpoint, config=config))
+    results = tmp_path / "results.jsonl"
+    for policy in (as_read, as_built):
+        results.write_text(result(0, is_success=True, policy=policy))
+        assert push(checkpoint, "--dry_run", "--results", str(results)) == 0
+        capsys.readouterr()
+    results.write_text(result(0, is_success=True, policy=replace(as_built, **change)))
+    assert push(checkpoint, "--dry_run", "--results", str(results)) == 1
+    assert "other --policy.* flags or processors were used" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["fdvla", "spatialvla_grid", "vla0_smol"])
+def test_records_of_earlier_releases_are_the_shipped_checkpoints(name: str, tmp_path: Path) -> None:
+    folder = shipped_checkpoint(name)
+    ours = sha256_of(folder / WEIGHTS)
+    with gzip.open(Path(__file__).parents[2] / "docs" / "media" / "shipped.jsonl.gz", "rt") as file:
+        line = next(line for line in file if ours in line)
+    (tmp_path / "results.jsonl").write_text(line)
+    check_policy_of(tmp_path, read_results(tmp_path / "results.jsonl"), folder)
 
 
 BROKEN = {
