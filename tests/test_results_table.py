@@ -15,8 +15,8 @@ type Printed = pytest.CaptureFixture[str]
 
 LEGEND = [
     "success: with 95 % Wilson interval; change: points, with 95 % interval, from the same episodes",
-    "unperturbed; both clustered by seed; p: exact McNemar test of independent pairs; where interval and p",
-    "disagree, trust p, but the interval where pairs share seeds",
+    "unperturbed; p: exact McNemar test; where interval and p disagree, trust p; with several tasks of one",
+    "seed, trust the interval, which counts a seed once",
 ]
 
 
