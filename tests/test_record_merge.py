@@ -77,7 +77,9 @@ def write_bomb(root: Path, actions: list[float]) -> Path:
     """Write an episode for each action, all of one spec."""
     column = {"dtype": "float32", "shape": (1,), "names": ["x"]}
     layout = DatasetLayout(REPO_ID, 10, "scara", {OBS_STATE: column, ACTION: column}, use_videos=False)
-    frames = [{OBS_STATE: np.ones(1, np.float32), ACTION: np.float32([x]), "task": "go"} for x in actions]
+    frames = [
+        {OBS_STATE: np.ones(1, np.float32), ACTION: np.array([x], np.float32), "task": "go"} for x in actions
+    ]
     write_block(layout, root, [RecordedEpisode([frame], {"bomb/spec": '{"seed": 0}'}) for frame in frames])
     return root
 

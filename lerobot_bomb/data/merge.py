@@ -56,7 +56,7 @@ def _refuse_same_episodes(folders: Sequence[Path]) -> None:
     """Raise a ValueError that names two folders which are one, or which hold the same episode of BOMB."""
     owners: dict[Any, Path] = {}
     for folder in folders:
-        found = {folder.resolve(): "are one dataset"}
+        found: dict[Any, str] = {folder.resolve(): "are one dataset"}
         for number, episode in enumerate(_identities(folder)):
             found.setdefault(episode, f"both hold episode {number} of {folder}")
         for each, what in found.items():

@@ -43,7 +43,8 @@ def _identities(checkpoint: Path) -> list["PolicyIdentity"]:
 
     config: Any = read_config(checkpoint, None)
     as_read = identity_of_config(config)
-    config.trained_with = trained_with(config, policy_class(checkpoint).as_trained)
+    found: Any = policy_class(checkpoint)
+    config.trained_with = trained_with(config, found.as_trained)
     return [as_read, identity_of_config(config)]
 
 
