@@ -14,7 +14,7 @@ from lerobot_bomb.bomb.board import COLORS
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import current_goal, expert_action
 from lerobot_bomb.bomb.goals import Course, course_goals
-from lerobot_bomb.bomb.judge import LIFT_M
+from lerobot_bomb.bomb.judge import LIFT_M, Judge
 from lerobot_bomb.bomb.move import TRAY, Made, distance_m, open_moves, place_name, stones_left
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
@@ -44,7 +44,7 @@ def other_goal(episode: Episode) -> tuple[int, Goal] | None:
             ]
             if others:
                 course = Course(plan, made, made, carried=others[-1])
-                return num_made, next(course_goals(course, episode.layout, xyz_at_start(episode)))
+                return num_made, next(course_goals(course, episode.layout, xyz_at_start(episode)))[1]
     return None
 
 
@@ -106,6 +106,18 @@ def test_label_and_masks_take_the_stone_left() -> None:
     env.close()
 
 
+def test_a_stone_beside_its_place_keeps_masks_right() -> None:
+    env = UndrawnEnv(EpisodeSpec(3, "goal", task_id=SWAP), SMALL)
+    env.reset(seed=3)
+    episode, xyz = env._run.episode, env._now.stone_xyz.copy()
+    aside, following, _ = episode.aims
+    xyz[aside.stone, :2] = np.add(aside.xy, (0.016, 0.005))
+    made: Made = {0: (aside.stone, aside.place)}
+    judge = Judge(episode, episode.spec.fps, replace(env._now, stone_xyz=xyz), made)
+    assert judge.goals()[0].stone == judge.next_goal().stone == following.stone
+    env.close()
+
+
 @pytest.mark.parametrize("is_made", [False, True], ids=["in_the_fingers", "made"])
 @pytest.mark.parametrize(
     ("suite", "task_id"),
@@ -127,6 +139,6 @@ def test_the_expert_finishes_what_another_begins(suite: str, task_id: int, is_ma
 def test_at_the_start_the_goals_are_the_aims(suite: str, seed: int) -> None:
     episode = sample_episode(EpisodeSpec(seed, suite))
     goals = course_goals(Course(episode.plans[0], {}, {}), episode.layout, xyz_at_start(episode))
-    assert [(goal.stone, *goal.xyz[:2], goal.is_slid) for goal in goals] == [
+    assert [(goal.stone, *goal.xyz[:2], goal.is_slid) for _, goal in goals] == [
         (aim.stone, *aim.xy, aim.is_slid) for aim in episode.aims
     ]

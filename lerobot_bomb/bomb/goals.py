@@ -26,14 +26,14 @@ class Course:
     carried: tuple[int, int] | None = None  # an open move, and the stone that makes it
 
 
-def course_goals(course: Course, layout: Layout, stone_xyz: np.ndarray) -> Iterator[Goal]:
-    """Yield goals: of moves whose stones lie in place, of the carried stone, of the other moves in order.
+def course_goals(course: Course, layout: Layout, stone_xyz: np.ndarray) -> Iterator[tuple[int, Goal]]:
+    """Yield moves' numbers and goals: those whose stones lie in place, that of the carried stone, the others.
 
     A made move whose stone lies elsewhere, as it may in the tray, has none: it must not be taken again.
     """
 
-    def goal(number: int, stone: int, xy: np.ndarray) -> Goal:
-        return Goal(np.array([*xy, layout.rest_height_m]), stone, course.plan[number].is_slid)
+    def goal(number: int, stone: int, xy: np.ndarray) -> tuple[int, Goal]:
+        return number, Goal(np.array([*xy, layout.rest_height_m]), stone, course.plan[number].is_slid)
 
     stone_xy = stone_xyz[:, :2].copy()  # after the moves so far
     for number, (stone, place) in course.lying.items():

@@ -1,6 +1,7 @@
 """Judge of an episode: follows the moves of its plans, and says how it ended."""
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -92,13 +93,14 @@ class Judge:
 
         There are always `Suite.num_goals`: the last one is repeated if need be.
         """
-        by_turns = len(self._episode.turns) > 1
-        courses = [
-            self._course(plan[: len(made) + 1] if by_turns else plan, made) for plan, made in self._plans
-        ]
-        course = max(courses, key=lambda each: (len(each.lying), each.carried is not None))
-        goals = tuple(course_goals(course, self._episode.layout, self._now.stone_xyz))
+        goals = tuple(goal for _, goal in self._goals_of(self._furthest_course()))
         return goals + goals[-1:] * (find_suite(self._episode.spec.suite).num_goals - len(goals))
+
+    def next_goal(self) -> Goal:
+        """Return the goal of the first move that has not been made; the last one if all have been."""
+        course = self._furthest_course()
+        goals = list(self._goals_of(course))
+        return next((goal for number, goal in goals if number not in course.made), goals[-1][1])
 
     def update(self, now: SceneState) -> bool:
         """Update with the state after a control step; return True if the episode has ended."""
@@ -141,6 +143,17 @@ class Judge:
             self.failure = Failure.TIMEOUT_HOLDING
         else:
             self.failure = Failure.DROPPED if was_lifted else Failure.MISSED_GRASP
+
+    def _goals_of(self, course: Course) -> Iterator[tuple[int, Goal]]:
+        return course_goals(course, self._episode.layout, self._now.stone_xyz)
+
+    def _furthest_course(self) -> Course:
+        """Return the course of the plan that has come furthest, as far as instructions have named it."""
+        by_turns = len(self._episode.turns) > 1
+        courses = [
+            self._course(plan[: len(made) + 1] if by_turns else plan, made) for plan, made in self._plans
+        ]
+        return max(courses, key=lambda each: (len(each.lying), each.carried is not None))
 
     def _course(self, plan: Plan, made: Made) -> Course:
         """Return how far a plan has come, by what lies in place and what the fingers carry."""

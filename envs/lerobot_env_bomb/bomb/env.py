@@ -203,9 +203,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
     def object_masks(self) -> dict[str, dict[str, np.ndarray]]:
         """{camera: {object: (H, W) bool}}: the pixels of each object in the observation's images."""
         run, size = self._run, self._render_options.image_size
-        goals = run.judge.goals()
-        goal = goals[min(run.judge.num_made, len(goals) - 1)]
-        radius_m = run.episode.layout.stone_radius_m
+        goal, radius_m = run.judge.next_goal(), run.episode.layout.stone_radius_m
         return {
             camera: object_masks(
                 run.scene, self._camera_renderer, camera, size, goal.stone, goal.xyz[:2], radius_m
