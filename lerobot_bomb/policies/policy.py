@@ -30,9 +30,9 @@ from lerobot_bomb.data.columns import (
     require_motion,
 )
 from lerobot_bomb.decoding.kv_cache import check_positions
-from lerobot_bomb.flow.noise import SamplingNoise, gumbel
+from lerobot_bomb.flow.noise import SamplingNoise
 from lerobot_bomb.hub.policy import HubPolicy
-from lerobot_bomb.policies.config import ChunkConfig, TokenVlaConfig, VlaConfig
+from lerobot_bomb.policies.config import ChunkConfig, VlaConfig
 from lerobot_bomb.policies.relative_config import RelativeVlaConfig
 from lerobot_bomb.training.distributed import SavesTiedWeightsOnce
 from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_fit, trained_with
@@ -58,6 +58,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     config_class = ChunkConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
     name = "chunk"  # pyright: ignore[reportAssignmentType]
     config: ChunkConfig
+    _sampling_noise: SamplingNoise | None = None  # of types that sample
     action_unit: Tensor
     # flags that say what shapes the weights have
     shapes: ClassVar[tuple[str, ...]]
@@ -136,10 +137,14 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     def reset(self) -> None:
         self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
         self._batch_size: int | None = None  # of the episodes that are under way
+        if self._sampling_noise is not None:
+            self._sampling_noise.begin()
 
     def reset_to(self, first_episode: int) -> None:
         """Reset, to act as in a batch that begins with this episode of an evaluation."""
         self.reset()
+        if self._sampling_noise is not None:
+            self._sampling_noise.begin(first_episode)
 
     def drop_queued_actions(self) -> None:
         """Let the next `select_action` predict; LeRobot 0.6.2 calls this when the instruction changes."""
@@ -423,46 +428,6 @@ class RelativeVlaPolicy(VlaPolicy):
     def _unit(self) -> Tensor:
         """(D,) physical size of 1 in predicted actions."""
         return self.action_unit if self.relative is None else self.action_unit * self.relative.scale
-
-
-class TokenVlaPolicy(VlaPolicy):
-    """Policy whose actions are tokens; it writes only those that are executed."""
-
-    config_class = TokenVlaConfig  # pyright: ignore[reportAssignmentType]
-    name = "token_vla"  # pyright: ignore[reportAssignmentType]
-    config: TokenVlaConfig
-
-    def __init__(self, config: Any, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
-        super().__init__(config, dataset_meta)
-        self._sampling_noise = SamplingNoise(config.noise_seed, is_per_episode=True, draw=gumbel)
-
-    def reset(self) -> None:
-        super().reset()
-        self._sampling_noise.begin()
-
-    def reset_to(self, first_episode: int) -> None:
-        super().reset_to(first_episode)
-        self._sampling_noise.begin(first_episode)
-
-    def predict_action_chunk(
-        self,
-        batch: dict[str, Tensor],
-        *,
-        inference_delay: int | None = None,
-        prev_chunk_left_over: Tensor | None = None,
-    ) -> Tensor:
-        """(B, T, D) normalised actions.
-
-        The other arguments come from LeRobot's real-time chunking; they do not guide a chunk of tokens.
-        """
-        return super().predict_action_chunk(batch)
-
-    def _choice_noise(self, batch_size: int, shape: tuple[int, ...]) -> Tensor | None:
-        """Return noise (B, *shape) that makes the argmax of logits a sample; None for a greedy choice."""
-        if not self.config.temperature:
-            return None
-        noise = self._sampling_noise.draw(batch_size, shape)
-        return self.config.temperature * noise.to(self._device)
 
 
 def _action_statistics(meta: LeRobotDatasetMetadata) -> Statistics:

@@ -58,6 +58,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     name = "fdvla"  # pyright: ignore[reportAssignmentType]
     method = METHOD
     config: FdvlaConfig
+    _sampling_noise: SamplingNoise
     shapes, as_trained = SHAPES, AS_TRAINED
     # modules that FSDP shards one by one; accelerate reads the second name
     _fsdp_wrap_modules: ClassVar[list[str]] = ["Qwen2_5_VLDecoderLayer", "Qwen2_5_VLVisionBlock"]
@@ -115,14 +116,6 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         return peft_targets(self, "language_model", NEW_PARTS)
-
-    def reset(self) -> None:
-        super().reset()
-        self._sampling_noise.begin()
-
-    def reset_to(self, first_episode: int) -> None:
-        super().reset_to(first_episode)
-        self._sampling_noise.begin(first_episode)
 
     # Training
 

@@ -31,7 +31,7 @@ from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.slots import SlotDecoder
 from lerobot_bomb.policies.pointing_policy import BOARD_READER, PointingVlaPolicy
-from lerobot_bomb.policies.policy import TokenVlaPolicy
+from lerobot_bomb.policies.token_policy import TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.vlm.depth import load_zoedepth
 from lerobot_bomb.vlm.ego3d import Ego3D

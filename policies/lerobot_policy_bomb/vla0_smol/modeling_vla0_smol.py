@@ -38,7 +38,8 @@ from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.policies.pointing_policy import BOARD_READER, Parts, PointingVlaPolicy
-from lerobot_bomb.policies.policy import RelativeVlaPolicy, TokenVlaPolicy
+from lerobot_bomb.policies.policy import RelativeVlaPolicy
+from lerobot_bomb.policies.token_policy import TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.vlm.color_jitter import ColorJitter
 from lerobot_bomb.vlm.images import crop, encode_images
