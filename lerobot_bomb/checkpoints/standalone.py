@@ -1,5 +1,6 @@
 """A checkpoint that acts on images, state and instruction from outside LeRobot, as lerobot-eval calls it."""
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ class StandalonePolicy:
         checkpoint: the folder that lerobot-train names pretrained_model, or bomb:NAME.
         device: cpu, cuda, ...; None: the checkpoint's own.
         seed: of the policy's random numbers, as --seed of lerobot-eval.
-        flags: other values of its config: "--num_inference_steps=3".
+        values: others of its config: {"num_inference_steps": 3}.
         cameras: {camera of the policy: its name in the benchmark}; a camera left out has the same name.
         resize: stretch images to the size that the checkpoint reads; without it, other sizes are refused.
 
@@ -38,10 +39,11 @@ class StandalonePolicy:
         checkpoint: str,
         device: str | None,
         seed: int,
-        flags: list[str],
+        values: Mapping[str, Any],
         cameras: Mapping[str, str],
         resize: bool,
     ) -> None:
+        flags = [f"--{name}={json.dumps(value)}" for name, value in values.items()]
         self.config = config = read_config(Path(checkpoint_path(checkpoint)), device, flags)
         if config.use_peft:
             raise ValueError(

@@ -138,16 +138,24 @@ def check_video(path: Path, num_frames: int, fps: float) -> None:
         raise ValueError(f"{path} has {num_found} whole frames, not the {num_frames} of its episodes")
 
 
+def episode_tables(root: Path) -> list[pa.Table]:
+    """Read the files of LeRobot's table of episodes, in their order; [] if there is none.
+
+    Raises:
+        ValueError: a file is truncated, or of another format.
+    """
+    return [read_parquet(path) for path in sorted((root / EPISODES_FOLDER).rglob("*.parquet"))]
+
+
 def read_episodes(root: Path, info: Info) -> pa.Table:
     """Read the table of episodes, in the order of their index.
 
     Raises:
         OSError, ValueError: a file is missing or damaged, or the episodes are not those of info.json.
     """
-    files = sorted((root / EPISODES_FOLDER).rglob("*.parquet"))
-    if not files:
+    tables = episode_tables(root)
+    if not tables:
         raise FileNotFoundError(f"{root / EPISODES_FOLDER} holds no table of episodes")
-    tables = [read_parquet(path) for path in files]
     try:
         episodes = pa.concat_tables(tables, promote_options="default")
         lengths = episodes["length"].to_numpy()

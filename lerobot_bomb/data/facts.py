@@ -8,7 +8,7 @@ from typing import Any
 
 from lerobot_bomb.bomb.environment import Environment, numbered_tasks
 from lerobot_bomb.bomb.suite import suites_of
-from lerobot_bomb.data.dataset_files import EPISODES_FOLDER, INFO_FILE, read_parquet
+from lerobot_bomb.data.dataset_files import INFO_FILE, episode_tables
 from lerobot_bomb.data.recording import SCENES
 from lerobot_bomb.data.unfinished import METADATA_FILE
 from lerobot_bomb.files import read_json
@@ -174,7 +174,7 @@ def _read_specs(root: Path, info: Mapping[str, Any]) -> list[dict[str, Any]] | N
     Raises:
         ValueError: a table of episodes is truncated.
     """
-    tables = [read_parquet(path) for path in sorted((root / EPISODES_FOLDER).rglob("*.parquet"))]
+    tables = episode_tables(root)
     names = [SPEC_COLUMN, "length", *([LEAST_DONE] if DONE in info["features"] else [])]
     if not tables or any(not set(names) <= set(table.column_names) for table in tables):
         return None

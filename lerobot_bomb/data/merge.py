@@ -9,7 +9,7 @@ from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, OBS_STATE
 
 from lerobot_bomb.data.blocks import DatasetLayout, merge_blocks
 from lerobot_bomb.data.columns import read_meta
-from lerobot_bomb.data.dataset_files import EPISODES_FOLDER, read_parquet
+from lerobot_bomb.data.dataset_files import episode_tables
 from lerobot_bomb.data.facts import SPEC_COLUMN
 from lerobot_bomb.data.unfinished import unfinished_folder
 
@@ -67,7 +67,7 @@ def _refuse_same_episodes(folders: Sequence[Path]) -> None:
 
 def _identities(folder: Path) -> list[str]:
     """Return a text for each episode that is equal for the same episode; [] for datasets of others."""
-    tables = [read_parquet(path) for path in sorted((folder / EPISODES_FOLDER).rglob("*.parquet"))]
+    tables = episode_tables(folder)
     if any(name not in table.column_names for table in tables for name in IDENTITY):
         return []
     return [str(row) for table in tables for row in table.select(IDENTITY).to_pylist()]

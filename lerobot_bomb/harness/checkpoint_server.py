@@ -48,8 +48,7 @@ class CheckpointServer(PredictModelServer):
         observation_params: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        flags = [f"--{name}={json.dumps(value)}" for name, value in (policy or {}).items()]
-        self._policy = StandalonePolicy(checkpoint, device, seed, flags, cameras or {}, resize)
+        self._policy = StandalonePolicy(checkpoint, device, seed, policy or {}, cameras or {}, resize)
         self._observation_params = observation_params or {}
         self._episode: SessionContext | None = None  # the one under way
         self._environment: Environment | None = None  # where it acts, if that is BOMB

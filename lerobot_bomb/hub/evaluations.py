@@ -30,9 +30,8 @@ def model_index(groups: list[Group]) -> list[EvalResult]:
             task_name=suite_or_task(records[0]),
             dataset_type=group.record_type.env_type,
             dataset_name=group.records[0].benchmark(),
-            dataset_config=condition_key(
-                records[0], condition
-            ),  # tells results apart, which their task does not
+            # tells results apart, which their task does not
+            dataset_config=condition_key(records[0], condition),
             metric_type=METRIC,
             metric_name="success rate",
             metric_value=_share(records),

@@ -1,6 +1,5 @@
 """A LeRobot checkpoint as a policy of Inspect Robots."""
 
-import json
 from typing import Any
 
 import numpy as np
@@ -48,8 +47,7 @@ class CheckpointPolicy(PolicyBase):
     ) -> None:
         with config_errors():
             names = _names_of(cameras)
-            flags = [f"--{name}={json.dumps(value)}" for name, value in values.items()]
-            self._policy = StandalonePolicy(checkpoint, device, seed, flags, names, resize)
+            self._policy = StandalonePolicy(checkpoint, device, seed, values, names, resize)
         self._state = state.split(",") if self._policy.reads_state else []
         config: Any = self._policy.config
         environment = trained_environment(config)

@@ -3,10 +3,10 @@
 import gymnasium
 import numpy as np
 
+from lerobot_bomb.data.libero_recording import ENV_ID
 from lerobot_bomb.libero.episode import LiberoSpec
 from lerobot_bomb.viewing.sheet import text_tile
 
-ENV_ID = "lerobot_env_bomb:bomb_libero/Libero-v0"
 ACTIONS = [[0.5, 0.0, -0.8, 0.0, 0.0, 0.0, -1.0]] * 12  # forwards and down
 
 
