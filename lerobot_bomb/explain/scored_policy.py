@@ -162,6 +162,38 @@ class ScoredPromptPolicy(ScoredPolicy):
         return {part: span.start + mask_L[span].nonzero()[:, 0] for part, span in spans.items()}
 
 
+class TokenPolicy(PromptPolicy, Protocol):
+    """Members of our policies of tokens that scores need besides."""
+
+    config: Any
+
+    def write(self, batch: Batch, num_steps: int) -> Tensor: ...
+
+
+class ScoredTokenPolicy(ScoredPromptPolicy):
+    """One of our policies whose answers are the tokens of a whole chunk, (1, S).
+
+    A score is the answer's log-probability.
+
+    Raises:
+        ValueError: the policy's answers are samples.
+    """
+
+    policy: TokenPolicy
+    unit: ClassVar[str] = "nats"
+
+    def __init__(self, policy: TokenPolicy):
+        if temperature := policy.config.temperature:
+            raise ValueError(
+                f"--policy.temperature={temperature}: an explanation is of the likeliest answer; give "
+                "--policy.temperature=0"
+            )
+        super().__init__(policy)
+
+    def answer(self, batch: Batch) -> Tensor:
+        return self.policy.write(batch, self.policy.config.chunk_size)
+
+
 def repeated(values: Batch, times: int) -> Batch:
     """A batch of one row -> the same row `times` times."""
     return {
@@ -188,12 +220,3 @@ def scores_of(policy: ScoredPolicy, rows: Rows, answer: Tensor, batch_size: int)
         for start in range(0, num_rows, batch_size)
     ]
     return torch.cat(parts)
-
-
-def check_greedy(temperature: float) -> None:
-    """Raise a ValueError if a policy's answers are samples."""
-    if temperature:
-        raise ValueError(
-            f"--policy.temperature={temperature}: an explanation is of the likeliest answer; give "
-            "--policy.temperature=0"
-        )

@@ -1,34 +1,19 @@
 """``spatialvla_grid`` as explanations score its answers: by the log-probability of their cells."""
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from lerobot_bomb.explain.scored_policy import (
-    ANSWER,
-    Batch,
-    Rows,
-    ScoredPromptPolicy,
-    TokenSpan,
-    check_greedy,
-)
+from lerobot_bomb.explain.scored_policy import ANSWER, Batch, Rows, ScoredTokenPolicy, TokenSpan
 
 if TYPE_CHECKING:
     from lerobot_policy_bomb.spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 
-class ScoredSpatialvlaGrid(ScoredPromptPolicy):
+class ScoredSpatialvlaGrid(ScoredTokenPolicy):
     """Answers are the pointing tokens and those of a whole chunk, (1, S)."""
 
     policy: "SpatialvlaGridPolicy"
-    unit: ClassVar[str] = "nats"
-
-    def __init__(self, policy: "SpatialvlaGridPolicy"):
-        check_greedy(policy.config.temperature)
-        super().__init__(policy)
-
-    def answer(self, batch: Batch) -> Tensor:
-        return self.policy.write(batch, self.policy.config.chunk_size)
 
     def read(self, batch: Batch, ids_BL: Tensor) -> Rows:
         return {"embeds": self.policy.embed(ids_BL, self.policy.encode_images(batch))}

@@ -1,34 +1,19 @@
 """``vla0_smol`` as explanations score its answers: by their log-probability, under the grammar."""
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from lerobot_bomb.explain.scored_policy import (
-    ANSWER,
-    Batch,
-    Rows,
-    ScoredPromptPolicy,
-    TokenSpan,
-    check_greedy,
-)
+from lerobot_bomb.explain.scored_policy import ANSWER, Batch, Rows, ScoredTokenPolicy, TokenSpan
 
 if TYPE_CHECKING:
     from lerobot_policy_bomb.vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 
-class ScoredVla0Smol(ScoredPromptPolicy):
+class ScoredVla0Smol(ScoredTokenPolicy):
     """Answers are the numbers of a whole chunk, (1, N)."""
 
     policy: "Vla0SmolPolicy"
-    unit: ClassVar[str] = "nats"
-
-    def __init__(self, policy: "Vla0SmolPolicy"):
-        check_greedy(policy.config.temperature)
-        super().__init__(policy)
-
-    def answer(self, batch: Batch) -> Tensor:
-        return self.policy.write(batch, self.policy.config.chunk_size)
 
     def read(self, batch: Batch, ids_BL: Tensor) -> Rows:
         return {"features": self.policy.encode_images(batch)}
