@@ -38,6 +38,17 @@ def test_links_and_images_exist_and_no_place_is_left_open(page: Path) -> None:
     assert re.findall(r"\{[A-Z_]{3,}\}|TODO|FIXME", text) == []
 
 
+def test_every_path_of_a_package_that_the_pages_name_exists() -> None:
+    named = {
+        path
+        for page in [*PAGES, ROOT / "CONTRIBUTING.md"]
+        for path in re.findall(r"`((?:envs|policies)/lerobot_[^`\s*]+)`", page.read_text())
+        if "NAME" not in path
+    }
+    assert len(named) > 5
+    assert sorted(path for path in named if not (ROOT / path).exists()) == []
+
+
 def test_the_sites_navigation_is_the_map_of_the_documentation() -> None:
     nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
     sections = {name: pages for entry in nav for name, pages in entry.items() if isinstance(pages, list)}
