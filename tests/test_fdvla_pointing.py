@@ -85,6 +85,19 @@ def test_off_it_has_no_weights_and_reads_no_labels() -> None:
     assert torch.isfinite(loss) and "place_loss" not in metrics
 
 
+def test_metrics_tell_which_places_and_stones_are_read() -> None:
+    policy = pointing_policy()
+    assert policy.pointer is not None
+    batch = pointing_batch(policy)
+    batch[STONE][:, :2] = torch.tensor(SPOTS_XY_M)[[30, 40, 50, 50]] + 0.002
+    point_at(policy, 2)
+    with torch.no_grad():
+        policy.pointer.spot.weight.zero_()
+        policy.pointer.spot.bias.copy_(torch.nn.functional.one_hot(torch.tensor(50), len(SPOTS_XY_M)))
+    metrics = policy(batch)[1]
+    assert metrics["place_accuracy"] == 0.25 and metrics["spot_accuracy"] == 0.5
+
+
 def test_labels_are_of_training_only() -> None:
     policy = pointing_policy()
     policy.predict_action_chunk(make_batch(policy, 2))

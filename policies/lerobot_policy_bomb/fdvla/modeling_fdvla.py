@@ -134,7 +134,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         with self.autocast(), second_derivatives(self.config.has_energy):
             if self.config.has_energy:
                 point.actions.requires_grad_()
-            context, pointing, features_BPH = self._read_and_point(batch, labels)
+            context, pointed, features_BPH = self._read_and_point(batch, labels)
             heads = self._heads(context, loss_mask_BK)
             predicted = velocity_BKD, noise_BKD = heads(point.actions, point.tau)
             loss, terms = self._joint_loss(
@@ -150,12 +150,16 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
             loss = loss.unflatten(0, (-1, draws)).mean(dim=1)
         elif self.training:
             loss = weighed(loss, loss_mask_BK)
-        for name, loss_B in pointing.items():
-            loss = plus(loss, self.config.pointing_loss_weight, loss_B)
-            terms[name] = loss_B.detach().mean()
+        parts: Parts = {}
+        if self.pointer is not None and pointed is not None and labels is not None:
+            for name, loss_B in self.pointer.losses(pointed, labels).items():
+                loss = plus(loss, self.config.pointing_loss_weight, loss_B)
+                terms[name] = loss_B.detach().mean()
+            parts = self.pointer.parts(pointed, labels)
         loss, board = self._with_board(loss, batch, features_BPH)
+        parts |= board
         return loss, self._metrics(
-            loss, terms, board, velocity_BKD, noise_BKD, point, actions_BKD, loss_mask_BK
+            loss, terms, parts, velocity_BKD, noise_BKD, point, actions_BKD, loss_mask_BK
         )
 
     def _joint_loss(
@@ -190,18 +194,18 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
 
     def _read_and_point(
         self, batch: dict[str, Tensor], labels: Labels | None
-    ) -> tuple[Context, dict[str, Tensor], Tensor]:
-        """Return the context with the places that the heads are given, and losses (B,) of pointing.
+    ) -> tuple[Context, Pointed | None, Tensor]:
+        """Return the context with the places that the heads are given, and what the policy points at.
 
         Also return image features (B, P, H), P of all cameras, as the language model reads them.
         """
         context, embeds_BLH = self._read_embeds(batch)
         features_BPH = embeds_BLH[:, self.layout.image_columns(embeds_BLH.device)]
         if self.pointer is None or labels is None:
-            return context, {}, features_BPH
+            return context, None, features_BPH
         pointed = self._point(context, self._of_batch(batch, OBS_STATE))
         context = replace(context, feedback=self.pointer.feed_back(pointed, labels.given))
-        return context, self.pointer.losses(pointed, labels), features_BPH
+        return context, pointed, features_BPH
 
     def _actions(self, batch: dict[str, Tensor]) -> Tensor:
         """Read actions (B, K, D) as the heads predict them: normalised, and relative if configured."""
@@ -219,14 +223,14 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         self,
         loss: Tensor,
         terms: dict[str, Tensor],
-        board: Parts,
+        read: Parts,
         velocity_BKD: Tensor | None,
         noise_BKD: Tensor | None,
         point: PathPoint,
         actions_BKD: Tensor,
         loss_mask_BK: Tensor,
     ) -> dict[str, float]:
-        """Return loss terms, and errors of the actions that A^tau and a head imply, in the data's units.
+        """Return loss terms, what was read, and errors of the actions that A^tau and a head imply.
 
         Errors are known only with a dataset, that is in training. Padded actions do not count.
         """
@@ -234,7 +238,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         limits = self.config.denoise_tau_min, self.config.clip_sample_range
         errors_BKD = point.implied_actions(velocity_BKD, noise_BKD, *limits) - actions_BKD
         errors_BKD = errors_BKD.abs() * self._unit
-        parts |= board | self._l1_parts(errors_BKD, loss_mask_BK[..., None].expand_as(errors_BKD))
+        parts |= read | self._l1_parts(errors_BKD, loss_mask_BK[..., None].expand_as(errors_BKD))
         return means(parts, loss, self.config.trained_batches)
 
     # Inference

@@ -16,6 +16,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy,
 
 from lerobot_bomb.bomb.pointing import SPOTS_XY_M, PointedAt
 from lerobot_bomb.policies.pointing import DataUnits, Labels, number_of
+from lerobot_bomb.policies.pointing_policy import Parts
 from lerobot_policy_bomb.fdvla.configuration_fdvla import FdvlaConfig
 
 FEEDBACK_DIM = 128
@@ -125,6 +126,15 @@ class Pointer(DataUnits):
             "stone_loss": errors_B2.mean(dim=1),
             "held_loss": binary_cross_entropy_with_logits(pointed.held_logit, labels.held, reduction="none"),
         }
+
+    @torch.no_grad()
+    def parts(self, pointed: Pointed, labels: Labels) -> Parts:
+        """Return which places and spots are right, as `means` takes them."""
+        right = {
+            "place": pointed.place_logits.argmax(dim=1) == labels.place,
+            "spot": pointed.spot_logits.argmax(dim=1) == number_of(labels.stone_xy, self.spots),
+        }
+        return {f"{name}_accuracy": (right_B, torch.ones_like(right_B)) for name, right_B in right.items()}
 
     def labels(
         self, batch: dict[str, Any], other_share: float, policy_type: str, generator: torch.Generator
