@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
-from lerobot_bomb.data.columns import dim_names, episode_bounds, read_columns
+from lerobot_bomb.data.columns import DONE, EPISODE_INDEX, dim_names, episode_bounds, read_columns, run_index
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 
@@ -81,6 +81,13 @@ def test_an_absent_data_file_is_named(dataset: LeRobotDataset, tmp_path: Path) -
     (tmp_path / "meta").symlink_to(dataset.root / "meta")
     with pytest.raises(FileNotFoundError, match=r"file-000\.parquet"):
         read_columns(LeRobotDatasetMetadata("test/columns", root=tmp_path), KEYS)
+
+
+def test_runs_are_episodes_or_static_scenes() -> None:
+    episodes = {EPISODE_INDEX: np.array([3, 3, 3, 5, 5])}
+    assert run_index(episodes).tolist() == [0, 0, 0, 1, 1]
+    done = np.array([[False], [False], [True], [True], [True]])  # episode 5 holds scenes
+    assert run_index(episodes | {DONE: done}).tolist() == [0, 0, 0, 1, 2]
 
 
 def test_episode_bounds() -> None:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 
 from lerobot_bomb.evaluation.trivial import Demonstrations
@@ -6,6 +8,7 @@ DEMONSTRATIONS = Demonstrations(
     actions=np.array([[0.0, 0.0], [1.0, 10.0], [3.0, 10.0], [8.0, 8.0], [9.0, 6.0]]),
     states=np.array([[5.0, 5.0], [0.5, 1.0], [1.5, 9.0], [7.0, 7.0], [8.5, 8.5]]),
     episode_index=np.array([4, 4, 4, 7, 7]),
+    run_index=np.array([0, 0, 0, 1, 1]),
     is_train=np.array([True, True, True, False, False]),
 )
 
@@ -28,9 +31,14 @@ def test_trivial_predictors_by_hand() -> None:
     np.testing.assert_allclose(chunks["mean"][4], [[4 / 3, 20 / 3]] * 2)
 
 
+def test_nothing_precedes_or_follows_a_static_scene() -> None:
+    scenes = replace(DEMONSTRATIONS, run_index=np.arange(5))
+    chunks, is_pad = scenes.recorded(np.array([1]), chunk_size=2)
+    assert chunks.tolist() == [[[1, 10], [1, 10]]] and is_pad.tolist() == [[False, True]]
+    assert scenes.trivial(np.array([2]), chunk_size=1)["repeat"].tolist() == [[[1.5, 9]]]
+
+
 def test_without_a_state_the_mean_stands_in_and_nothing_is_held() -> None:
-    chunks = Demonstrations(
-        DEMONSTRATIONS.actions, None, DEMONSTRATIONS.episode_index, DEMONSTRATIONS.is_train
-    ).trivial(np.array([3]), chunk_size=1)
+    chunks = replace(DEMONSTRATIONS, states=None).trivial(np.array([3]), chunk_size=1)
     assert set(chunks) == {"repeat", "extrapolate", "mean"}
     np.testing.assert_allclose(chunks["repeat"][0], [[4 / 3, 20 / 3]])

@@ -1,6 +1,6 @@
 """Columns of a dataset, read without its images."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,8 +61,8 @@ def require_motion(meta: LeRobotDatasetMetadata, use: str) -> None:
     if DONE not in meta.features:
         return
     columns = read_columns(meta, (DONE,), present_episodes(meta))
-    episode_N, is_done_N = columns[EPISODE_INDEX], columns[DONE].reshape(-1) > 0
-    is_scene_N = is_done_N[:-1] & (episode_N[1:] == episode_N[:-1])
+    episode_N = columns[EPISODE_INDEX]
+    is_scene_N = (np.diff(run_index(columns)) > 0) & (episode_N[1:] == episode_N[:-1])
     if is_scene_N.any():
         raise ValueError(
             f"episode {int(episode_N[is_scene_N.argmax()])} of {meta.repo_id} holds static scenes, which do "
@@ -123,6 +123,18 @@ def episode_bounds(episode_index_N: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         np.searchsorted(episode_index_N, episode_index_N, side="left"),
         np.searchsorted(episode_index_N, episode_index_N, side="right"),
     )
+
+
+def run_index(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return (N,) int64, which run of frames that follow each other a row belongs to.
+
+    A run is an episode, or a static scene of one: `next.done`, where ``columns`` has it, is true in each.
+    """
+    episode_N = columns[EPISODE_INDEX]
+    is_last_N = episode_N[1:] != episode_N[:-1]
+    if DONE in columns:
+        is_last_N |= columns[DONE].reshape(-1)[:-1] > 0
+    return np.concatenate([[0], np.cumsum(is_last_N)]).astype(np.int64)
 
 
 def _check_columns(meta: LeRobotDatasetMetadata, columns: list[str]) -> None:
