@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .PHONY: help setup demo demo-train test test-long test-cuda judges neighbours test-lerobot mutants check build \
-	reference docs clean
+	reference docs play clean
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -28,6 +28,7 @@ help:
 	@echo "make build      sdist and wheel into dist/, tried in an environment of their own"
 	@echo "make reference  docs/reference/, from the code"
 	@echo "make docs       the documentation as a site, into site/"
+	@echo "make play       the page on which BOMB plays in a browser, into site/play/; needs npm"
 	@echo "make setup      only set up .venv"
 
 setup: $(STAMP)
@@ -92,6 +93,11 @@ docs: $(STAMP)
 	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt --group docs
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "Built: site/index.html"
+	@$(MAKE) --no-print-directory play
+
+play: $(STAMP)
+	@npm install --silent --no-package-lock --no-audit --no-fund --prefix docs/play
+	@$(BIN)/python docs/make_play.py site/play
 
 clean:
 	rm -rf .venv

@@ -1,0 +1,75 @@
+// One episode: where it starts, and a run of it by the expert.
+import { robots } from "./constants.js";
+import { expertAction } from "./expert.js";
+import { Judge } from "./judge.js";
+import { Actuator } from "./scene.js";
+
+/** The episode of a task with a seed's place in SEEDS; `axis` null: without perturbation. */
+export function drawEpisode(suite, task, seedPlace, axis, level) {
+  const nominal = suite.episodes[task][seedPlace];
+  const change = axis === null ? {} : nominal.axes[axis][level - 1];
+  const episode = { ...nominal, ...change };
+  const edits = [episode.pattern, episode.edit].filter((number) => number !== null && number !== undefined);
+  return { ...episode, edits: edits.map((number) => suite.edits[number]) };
+}
+
+/** A run of an episode by the expert, to be advanced substep by substep. */
+export class Run {
+  constructor(sceneOfRun, suite, episode, noise) {
+    this.scene = sceneOfRun;
+    this.episode = episode;
+    this.steps = 0;
+    this.hasEnded = false;
+    this.maxSteps = suite.max_steps;
+    sceneOfRun.reset(episode, episode.edits);
+    this.now = sceneOfRun.measure();
+    this.judge = new Judge(episode, suite, this.now);
+    this._actuator = new Actuator(episode, noise);
+    this._substeps = this._simulate();
+  }
+
+  get instruction() {
+    const { instructions } = this.episode;
+    return instructions[Math.min(this.judge.numMade, instructions.length - 1)];
+  }
+
+  /** Make a substep; return false once the episode has ended. */
+  advance() {
+    return !this._substeps.next().done;
+  }
+
+  /** Run to the end. */
+  finish() {
+    while (this.advance());
+  }
+
+  *_simulate() {
+    while (!this.hasEnded) {
+      const [target, openFingers] = this._actuator.command(this.act(), this.now.gripperXyz);
+      yield* this.scene.move(target, openFingers);
+      this.now = this.scene.measure();
+      this.steps += 1;
+      this.hasEnded = this.judge.update(this.now);
+      if (!this.hasEnded && this.steps >= this.maxSteps) {
+        this.judge.timeOut();
+        this.hasEnded = true;
+      }
+    }
+  }
+
+  /** The expert's action. Observations and actions are float32, as between Python's policy and environment. */
+  act() {
+    const { judge, now, _actuator: actuator } = this;
+    const state = {
+      gripperXyz: now.gripperXyz.map(Math.fround),
+      fingerOpening: Math.fround(now.fingerOpening),
+      goals: judge.goals().map((goal) => ({ ...goal, xyz: goal.xyz.map(Math.fround) })),
+      stoneXyz: now.stoneXyz.map((xyz) => xyz.map(Math.fround)),
+      stoneRadiusM: Math.fround(judge.layout.stoneRadiusM),
+      maxOpeningM: Math.fround(2 * robots.MAX_HALF_OPENING_M),
+      pendingMotionM: actuator.pendingMotionM.map(Math.fround),
+      pendingGripper: Math.fround(actuator.pendingGripper),
+    };
+    return expertAction(state).map(Math.fround);
+  }
+}

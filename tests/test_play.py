@@ -1,0 +1,194 @@
+"""The page that plays BOMB in a browser: its simulation, expert and judge end episodes as Python's do."""
+
+import json
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import make_play
+import numpy as np
+import pytest
+
+from lerobot_bomb.bomb.episode import TEST_SEEDS, EpisodeSpec, Stage
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.perturbations import AXES
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
+from lerobot_bomb.bomb.suite import find_suite
+from lerobot_bomb.bomb.suites import OWN_SUITES
+from lerobot_env_bomb.bomb.env import BombEnv
+
+MUJOCO = make_play.SOURCES / make_play.MUJOCO
+RUNNER = Path(__file__).parent / "fixtures" / "play.mjs"
+SEEDS = TEST_SEEDS[:2]
+CLOSE_M = 1e-4  # of a stone's position at the end, in most episodes
+# in all: where fingers close on a stone, the solver stops one iteration sooner or later, by the last bit
+TOLERANCE_M = 4e-4
+
+needs_mujoco = pytest.mark.skipif(
+    shutil.which("node") is None or not (MUJOCO / "mujoco.wasm").is_file(),
+    reason="needs node and npm's @mujoco/mujoco, which `make play` installs",
+)
+
+
+def job(suite: str, task: int, seed: int, axis: str | None = None, level: int = 0) -> dict[str, Any]:
+    """An episode that both sides play."""
+    return {"suite": suite, "task": task, "seed": seed, "axis": axis, "level": level}
+
+
+def play(
+    suite: str,
+    task: int,
+    seed: int,
+    axis: str | None,
+    level: int,
+    act: Callable[[PrivilegedState], np.ndarray] = expert_action,
+) -> dict[str, Any]:
+    """How an episode ends in Python, and its actions."""
+    spec = find_suite(suite).of_task(EpisodeSpec(seed, suite), task)
+    spec = replace(spec, perturbations="none" if axis is None else f"{axis}:{level}")
+    env = BombEnv(spec, RenderOptions(image_size=32))
+    observation, info = env.reset(seed=seed)
+    instruction, actions, has_ended = env.task_description, [], False
+    while not has_ended:
+        actions.append(act(PrivilegedState.from_vector(observation["environment_state"])))
+        observation, _, terminated, truncated, info = env.step(actions[-1])
+        has_ended = terminated or truncated
+    stone_xyz = env.privileged_state().stone_xyz
+    env.close()
+    kept = ("is_success", "stage", "progress")
+    return {name: info[name] for name in kept} | {
+        "instruction": instruction,
+        "steps": len(actions),
+        "failure": info["failure"] or None,
+        "stone_xyz": stone_xyz,
+        "actions": actions,
+    }
+
+
+def in_node(page: Path, jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """How episodes end in JavaScript."""
+    command = ["node", RUNNER, page]
+    node = subprocess.run(command, input=json.dumps(jobs), capture_output=True, text=True, check=True)
+    return json.loads(node.stdout)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page with episodes of a few seeds."""
+    folder = tmp_path_factory.mktemp("play")
+    make_play.build(folder, MUJOCO, SEEDS)
+    return folder
+
+
+def check_alike(page: Path, jobs: list[dict[str, Any]]) -> list[float]:
+    """Play the episodes on both sides; return how far apart, in metres, a stone of each ends."""
+    apart_m = []
+    for each, there in zip(jobs, in_node(page, jobs), strict=True):
+        here = play(**each)
+        del here["actions"]
+        apart_m.append(float(np.abs(np.array(there["stone_xyz"]) - here.pop("stone_xyz")).max()))
+        # a stone comes to rest a step sooner or later
+        assert abs(there["steps"] - here.pop("steps")) <= 2, each
+        assert {name: there[name] for name in here} == here, each
+        assert apart_m[-1] < TOLERANCE_M, each
+    return apart_m
+
+
+@needs_mujoco
+def test_episodes_end_as_in_python(page: Path) -> None:
+    jobs = [job(suite, task, SEEDS[0]) for suite, task in zip(OWN_SUITES, (2, 10, 3, 17, 3), strict=True)]
+    jobs += [job("place", 3, SEEDS[1], axis, 5) for axis in ("dynamics", "object", "stones", "language")]
+    check_alike(page, jobs)
+
+
+@pytest.mark.long
+@needs_mujoco
+@pytest.mark.parametrize("suite", OWN_SUITES)
+def test_many_episodes_end_as_in_python(page: Path, suite: str) -> None:
+    tasks = range(min(find_suite(suite).num_tasks, 10))
+    apart_m = check_alike(page, [job(suite, task, seed) for task in tasks for seed in SEEDS])
+    assert sum(each < CLOSE_M for each in apart_m) >= 10
+    check_alike(page, [job(suite, 5, SEEDS[1], axis, level) for axis in AXES for level in (3, 5)])
+
+
+def still(state: PrivilegedState) -> np.ndarray:
+    """Do nothing."""
+    return np.array([0, 0, 0, 1], dtype=np.float32)
+
+
+def elsewhere(offset_m: float) -> Callable[[PrivilegedState], np.ndarray]:
+    """Act as the expert that puts the stone down beside its place."""
+
+    def act(state: PrivilegedState) -> np.ndarray:
+        goals = tuple(replace(goal, xyz=goal.xyz + np.array([0.0, offset_m, 0.0])) for goal in state.goals)
+        return expert_action(replace(state, goals=goals))
+
+    return act
+
+
+def another_stone(state: PrivilegedState) -> np.ndarray:
+    """Act as the expert that moves a stone that is not meant."""
+    goals = tuple(replace(goal, stone=(goal.stone + 1) % 2) for goal in state.goals)
+    return expert_action(replace(state, goals=goals))
+
+
+def lifting(state: PrivilegedState) -> np.ndarray:
+    """Act as the expert that carries a stone which is to be pushed."""
+    return expert_action(replace(state, goals=tuple(replace(goal, is_slid=False) for goal in state.goals)))
+
+
+def open_handed(state: PrivilegedState) -> np.ndarray:
+    """Act as the expert with fingers that never close."""
+    return np.array([*expert_action(state)[:3], 1], dtype=np.float32)
+
+
+def holding(state: PrivilegedState) -> np.ndarray:
+    """Act as the expert that lifts the stone and stays there."""
+    action = expert_action(state)
+    return np.array([0, 0, 0, -1], dtype=np.float32) if state.stage == Stage.LIFTED else action
+
+
+def dropping(state: PrivilegedState) -> np.ndarray:
+    """Act as the expert that lifts the stone high and lets it go."""
+    if state.stage != Stage.LIFTED:
+        return expert_action(state)
+    return np.array([0, 0, 1, -1 if state.gripper_xyz[2] < 0.1 else 1], dtype=np.float32)
+
+
+@needs_mujoco
+def test_failures_have_the_class_that_python_gives(page: Path) -> None:
+    policies = {
+        "never_reached": (job("place", 7, SEEDS[0]), still),
+        "missed_grasp": (job("place", 7, SEEDS[0]), open_handed),
+        "timeout_holding": (job("place", 7, SEEDS[0]), holding),
+        "dropped": (job("place", 7, SEEDS[0]), dropping),
+        "imprecise": (job("place", 12, SEEDS[1]), elsewhere(0.015)),
+        "wrong_intersection": (job("spatial", 5, SEEDS[1]), elsewhere(-0.045)),
+        "wrong_stone": (job("object", 0, SEEDS[0]), another_stone),
+        "lifted": (job("goal", 5, SEEDS[0]), lifting),
+    }
+    here = {name: play(**each, act=act) for name, (each, act) in policies.items()}
+    jobs = [
+        each | {"actions": [action.tolist() for action in here[name]["actions"]]}
+        for name, (each, _) in policies.items()
+    ]
+    there = in_node(page, jobs)
+    assert [each["failure"] for each in here.values()] == list(policies)
+    assert [each["failure"] for each in there] == list(policies)
+    assert [each["stage"] for each in there] == [each["stage"] for each in here.values()]
+
+
+@needs_mujoco
+def test_every_task_and_axis_is_there(page: Path) -> None:
+    for suite in OWN_SUITES:
+        record = json.loads((page / f"{suite}.json").read_text())
+        assert len(record["episodes"]) == find_suite(suite).num_tasks
+        for seed, drawn in zip(SEEDS, record["drawn"], strict=True):
+            assert drawn == find_suite(suite).sample(EpisodeSpec(seed, suite)).task_id
+        for episode in (each for task in record["episodes"] for each in task):
+            # every axis changes every episode, at every level
+            assert all(all(changes) for axis, changes in episode["axes"].items() if axis != "start")
