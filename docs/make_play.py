@@ -75,6 +75,9 @@ def constants() -> dict[str, dict[str, Any]]:
         "white": model_module.STONE_RGBA[True],
         "black": model_module.STONE_RGBA[False],
     }
+    # MuJoCo's WASM gives no access to arrays of bool
+    materials = model_module.compile_scene(robots.ROBOTS[ROBOT]).mat_texuniform
+    modules["model"]["TEXTURE_IS_UNIFORM"] = [bool(each) for each in materials]
     arm = robots.ROBOTS[ROBOT]
     modules["robots"] |= {
         "MAX_HALF_OPENING_M": arm.max_half_opening_m,

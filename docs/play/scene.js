@@ -96,16 +96,18 @@ export class Scene {
     this._mujoco.mj_forward(model, data);
   }
 
-  /** Measure the current poses and contacts. */
-  measure() {
-    const { site_xpos: sites, xpos, qpos } = this.data;
+  /** Measure the current positions. */
+  positions() {
+    const { site_xpos: sites, xpos } = this.data;
     const at = (array, index) => [...array.slice(3 * index, 3 * index + 3)];
-    return {
-      gripperXyz: at(sites, this._grip),
-      fingerOpening: this._fingers.reduce((sum, finger) => sum + qpos[finger], 0),
-      stoneXyz: this._bodies.map((body) => at(xpos, body)),
-      stoneTouched: this._touched(),
-    };
+    return { gripperXyz: at(sites, this._grip), stoneXyz: this._bodies.map((body) => at(xpos, body)) };
+  }
+
+  /** Measure the current positions and contacts. */
+  measure() {
+    const { qpos } = this.data;
+    const fingerOpening = this._fingers.reduce((sum, finger) => sum + qpos[finger], 0);
+    return { ...this.positions(), fingerOpening, stoneTouched: this._touched() };
   }
 
   /** [touched by the left, by the right pad] of each stone. */

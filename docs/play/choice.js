@@ -1,0 +1,52 @@
+// What is shown: suite, seed, task, axis and level, as the page's address and as flags of a command.
+import { SEEDS, SUITES, perturbations } from "./constants.js";
+
+const { AXES, MAX_LEVEL } = perturbations;
+export const DEFAULT_CHOICE = { suite: "place", seedPlace: 0, task: null, axis: null, level: 3 };
+
+/** A choice as the part of an address after "#"; task null: the one that the seed draws. */
+export function hashOf({ suite, seedPlace, task, axis, level }) {
+  const words = [`suite=${suite}`, `seed=${SEEDS[seedPlace]}`];
+  if (task !== null) words.push(`task=${task}`);
+  if (axis !== null) words.push(`axis=${axis}`, `level=${level}`);
+  return `#${words.join("&")}`;
+}
+
+/** The choice of an address; throws an Error with a message for the visitor. */
+export function choiceOf(hash) {
+  const asked = Object.fromEntries(new URLSearchParams(hash.replace(/^#/, "")));
+  const unknown = Object.keys(asked).filter((name) => !["suite", "seed", "task", "axis", "level"].includes(name));
+  if (unknown.length > 0) throw new Error(`The link asks for “${unknown[0].slice(0, 40)}”, which this page does not have.`);
+  const oneOf = (name, names) => {
+    if (names.includes(asked[name])) return asked[name];
+    throw new Error(`The link asks for ${name} “${asked[name].slice(0, 40)}”; there are ${names.join(", ")}.`);
+  };
+  const number = (name, low, high) => {
+    if (/^\d+$/.test(asked[name]) && asked[name] >= low && asked[name] <= high) return Number(asked[name]);
+    throw new Error(`The link asks for ${name} “${asked[name].slice(0, 40)}”; it goes from ${low} to ${high}.`);
+  };
+  const choice = { ...DEFAULT_CHOICE };
+  if ("suite" in asked) choice.suite = oneOf("suite", SUITES);
+  if ("seed" in asked) choice.seedPlace = SEEDS.indexOf(number("seed", SEEDS[0], SEEDS.at(-1)));
+  if ("task" in asked) choice.task = number("task", 0, Infinity);
+  if ("axis" in asked) choice.axis = oneOf("axis", Object.keys(AXES));
+  if ("level" in asked) choice.level = number("level", 1, MAX_LEVEL);
+  return choice;
+}
+
+/** The commands that repeat a choice: an evaluation, and a video. */
+export function commandsOf({ suite, seedPlace, task, axis, level }) {
+  const seed = `--seed=${SEEDS[seedPlace]}`;
+  const flags = [`--env.task=${suite}`];
+  if (task !== null) flags.push(`--env.task_ids='[${task}]'`);
+  const condition = axis === null ? null : `${axis}:${level}`;
+  return {
+    eval: [
+      "lerobot-eval --policy.type=bomb_expert --env.type=bomb",
+      ...flags,
+      ...(condition ? [`--env.perturbations='["${condition}"]'`] : []),
+      `${seed} --eval.n_episodes=1 --eval.batch_size=1`,
+    ].join(" "),
+    view: ["lerobot-bomb view", seed, ...flags, ...(condition ? [`--env.perturbations=${condition}`] : [])].join(" "),
+  };
+}
