@@ -6,6 +6,7 @@ SHELL := /bin/bash
 
 BIN := .venv/bin
 STAMP := .venv/.installed
+NPM_FLAGS ?= --omit=dev  # --include=dev: also what tests of the page in a browser need
 # two torch threads beside another job are many times slower than one
 export OMP_NUM_THREADS ?= 1
 # LeRobot imports 4000 files; where this is set, as in many images, every process compiles them anew
@@ -96,7 +97,8 @@ docs: $(STAMP)
 	@$(MAKE) --no-print-directory play
 
 play: $(STAMP)
-	@npm install --silent --no-package-lock --no-audit --no-fund --prefix docs/play
+	@mkdir -p .venv/npm && cp docs/play/package.json .venv/npm
+	@npm install --silent $(NPM_FLAGS) --no-package-lock --no-audit --no-fund --prefix .venv/npm
 	@$(BIN)/python docs/make_play.py site/play
 
 clean:

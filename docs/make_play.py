@@ -39,7 +39,8 @@ from lerobot_env_bomb.bomb.scene import EDITABLE, ModelEdit, Scene
 from lerobot_env_bomb.shared.mujoco_gl import mujoco
 
 SOURCES = Path(__file__).parent / "play"
-MUJOCO = Path("node_modules", "@mujoco", "mujoco")
+NODE_MODULES = Path(__file__).parents[1] / ".venv" / "npm" / "node_modules"
+MUJOCO = NODE_MODULES / "@mujoco" / "mujoco"
 MUJOCO_FILES = ("mujoco.js", "mujoco.wasm")
 NUM_SEEDS = 20  # from the first of the protocol's seeds on
 ROBOT = "scara"
@@ -324,7 +325,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="where the page is written")
     parser.add_argument("--seeds", type=int, default=NUM_SEEDS, help="number of seeds of each task")
-    parser.add_argument("--mujoco", type=Path, default=SOURCES / MUJOCO, help="folder of npm's package")
+    parser.add_argument("--mujoco", type=Path, default=MUJOCO, help="folder of npm's package")
     args = parser.parse_args()
     build(args.folder, args.mujoco, TEST_SEEDS[: args.seeds])
 

@@ -21,8 +21,10 @@ from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.bomb.suites import OWN_SUITES
 from lerobot_env_bomb.bomb.env import BombEnv
 
-MUJOCO = make_play.SOURCES / make_play.MUJOCO
+MUJOCO = make_play.MUJOCO
 RUNNER = Path(__file__).parent / "fixtures" / "play.mjs"
+VISITOR = RUNNER.with_name("play_in_browser.mjs")
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 SEEDS = TEST_SEEDS[:2]
 CLOSE_M = 1e-4  # of a stone's position at the end, in most episodes
 # in all: where fingers close on a stone, the solver stops one iteration sooner or later, by the last bit
@@ -31,6 +33,11 @@ TOLERANCE_M = 4e-4
 needs_mujoco = pytest.mark.skipif(
     shutil.which("node") is None or not (MUJOCO / "mujoco.wasm").is_file(),
     reason="needs node and npm's @mujoco/mujoco, which `make play` installs",
+)
+
+needs_browser = pytest.mark.skipif(
+    CHROMIUM is None or not (make_play.NODE_MODULES / "playwright-core").is_dir(),
+    reason="needs Chromium and npm's playwright-core: make play NPM_FLAGS=--include=dev",
 )
 
 
@@ -192,3 +199,69 @@ def test_every_task_and_axis_is_there(page: Path) -> None:
         for episode in (each for task in record["episodes"] for each in task):
             # every axis changes every episode, at every level
             assert all(all(changes) for axis, changes in episode["axes"].items() if axis != "start")
+
+
+@pytest.fixture(scope="module")
+def visit(page: Path) -> dict[str, Any]:
+    """What the page shows to a visitor who tries all of it."""
+    command = ["node", VISITOR, page, make_play.NODE_MODULES, str(CHROMIUM)]
+    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+@pytest.mark.long
+@needs_mujoco
+@needs_browser
+def test_a_sentence_a_click_and_keys_put_the_stone_there(visit: dict[str, Any]) -> None:
+    assert visit["problems"] == []
+    for tried in ("sentence", "click", "keyboard"):
+        assert visit[tried]["outcomes"][0].startswith("Success after "), visit[tried]
+    assert visit["sentence"]["hash"].endswith("task=13")  # black, row 2, column 3
+    assert visit["click"]["pressed"] == "row 0, column 4"
+    # from the target that seed 1000 draws, a row down and a column to the right
+    assert (visit["keyboard"]["from"], visit["keyboard"]["to"]) == ("row 1, column 0", "row 2, column 1")
+    assert visit["picture"]["hash"].endswith("task=37")  # white, the star point
+    assert "off the board" in visit["picture"]["message"]
+
+
+@pytest.mark.long
+@needs_mujoco
+@needs_browser
+def test_a_perturbed_episode_stands_beside_the_clean_one(visit: dict[str, Any]) -> None:
+    assert visit["compared"]["titles"] == ["Seed 1001, dynamics 5", "Same seed, clean"]
+    assert all(each.startswith("Success") for each in visit["compared"]["outcomes"])
+    assert (
+        "--env.task=goal --env.perturbations='[\"dynamics:5\"]' --seed=1001" in visit["compared"]["command"]
+    )
+    assert len(visit["tabs"]) == 2 and all(each.startswith("Success") for each in visit["tabs"])
+
+
+@pytest.mark.long
+@needs_mujoco
+@needs_browser
+@pytest.mark.parametrize(
+    ("tried", "said"),
+    {
+        "unknown": "does not understand “Mach mir bitte einen Kaffee.”",
+        "twisted": "does not understand",
+        "off_board": "Row 7, column 2 is off the board: rows and columns go from 0 to 4.",
+        "long": "10,002 characters",
+        "empty": "Type a sentence first.",
+        "markup": "does not understand “<img",
+        "#suite=chess": "goal, long, object, place, spatial",
+        "#seed=3": "it goes from 1000 to 1001",
+        "#axis=camera&level=9": "it goes from 1 to 5",
+        "#task=50": "Suite place has tasks 0 to 49",
+        "#suite=place&mode=x": "“mode”",
+    }.items(),
+)
+def test_what_the_page_cannot_do_it_says(visit: dict[str, Any], tried: str, said: str) -> None:
+    assert said in visit["refused"][tried]
+
+
+@pytest.mark.long
+@needs_mujoco
+@needs_browser
+def test_the_page_works_on_a_phone_and_says_what_a_browser_lacks(visit: dict[str, Any]) -> None:
+    assert visit["phone"] == {"width": 390, "violations": []}
+    assert "WebGL 2" in visit["missing"]["webgl"]
+    assert "WebAssembly" in visit["missing"]["wasm"]

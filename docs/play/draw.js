@@ -51,7 +51,11 @@ void main() {
 }`;
 
 /** Thrown where a browser has no WebGL 2. */
-export class NoWebGL extends Error {}
+export class NoWebGL extends Error {
+  constructor() {
+    super("This browser cannot draw here: it has no WebGL 2, or it is turned off.");
+  }
+}
 
 export class Drawer {
   /** @param side width and height of what is drawn, in pixels */
@@ -90,6 +94,7 @@ export class Drawer {
     const { _gl: gl } = this;
     gl.viewport(0, 0, this._canvas.width, this._canvas.height);
     gl.clearColor(0, 0, 0, 1);
+    gl.depthMask(true);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.CULL_FACE);
@@ -101,12 +106,12 @@ export class Drawer {
     this._set("moment", sensor ? Math.random() : 0);
     const shown = this._shownGeoms(scene.model);
     gl.disable(gl.BLEND);
-    gl.depthMask(true);
     for (const geom of shown.filter(({ rgba }) => rgba[3] >= OPAQUE)) this._drawGeom(scene, geom);
     gl.enable(gl.BLEND);
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ZERO, gl.ONE);
     gl.depthMask(false);
-    for (const geom of shown.filter(({ rgba }) => rgba[3] < OPAQUE)) this._drawGeom(scene, geom);
+    const transparent = shown.filter(({ rgba }) => rgba[3] < OPAQUE);
+    for (const geom of [...transparent, ...transparent.reverse()]) this._drawGeom(scene, geom); // twice, as MuJoCo
     canvas.getContext("2d").drawImage(this._canvas, 0, 0, canvas.width, canvas.height);
   }
 
@@ -237,7 +242,7 @@ function compile(gl) {
     gl.attachShader(program, shader);
   }
   gl.linkProgram(program);
-  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new NoWebGL(gl.getProgramInfoLog(program));
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new NoWebGL();
   return program;
 }
 

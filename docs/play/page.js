@@ -2,7 +2,7 @@
 import { nearestIntersection } from "./board.js";
 import { DEFAULT_CHOICE, choiceOf, commandsOf, hashOf } from "./choice.js";
 import { SEEDS, SUITES, board, episode as rules, perturbations } from "./constants.js";
-import { Drawer, NoWebGL, pointAt } from "./draw.js";
+import { Drawer, pointAt } from "./draw.js";
 import { Run, drawEpisode } from "./episode.js";
 import { isOffBoard } from "./judge.js";
 import { BoardMap } from "./map.js";
@@ -108,12 +108,13 @@ class Page {
     const shown = axis === null ? [null] : [axis, null];
     while (this._scenes.length < shown.length) this._scenes.push(new Scene(this._mujoco, this._files));
     while (this._views.length < shown.length) this._views.push(this._newView());
+    byId("runs").classList.toggle("compare", shown.length > 1);
     byId("runs").replaceChildren(...shown.map((_, i) => this._views[i].element));
     this._runs = shown.map((each, i) => {
       const episode = drawEpisode(record, this._task(record), seedPlace, each, level);
       const run = new Run(this._scenes[i], record, episode, this._noise?.[SEEDS[seedPlace]]);
       const clean = shown.length > 1 ? "Same seed, clean" : `Seed ${SEEDS[seedPlace]}`;
-      this._views[i].show(run, each === null ? clean : `${each.replace("_", " ")} at level ${level}`);
+      this._views[i].show(run, each === null ? clean : `Seed ${SEEDS[seedPlace]}, ${each.replace("_", " ")} ${level}`);
       return run;
     });
     this._update(record);
@@ -148,7 +149,8 @@ class Page {
     byId("level").value = level;
     byId("level").disabled = axis === null;
     byId("level-number").textContent = axis === null ? "" : level;
-    byId("axis-note").textContent = axis === null ? "" : noteOf(AXES[axis], level);
+    const notes = axis === null ? [] : notesOf(AXES[axis], level);
+    byId("axis-note").replaceChildren(...notes.map((note) => Object.assign(document.createElement("li"), { textContent: note })));
     byId("map-note").textContent = isPlace
       ? "Click, or use the arrow keys and Enter. Stones in the way are drawn anew."
       : "In this suite, choose a task; suite place lets you choose an intersection.";
@@ -190,7 +192,7 @@ class Page {
 
   async _showAndPlay(change) {
     await this._show({ ...this._choice, ...change });
-    byId("stage").scrollIntoView({ block: "nearest" });
+    if (matchMedia("(max-width: 60rem)").matches) byId("stage").scrollIntoView();
     this._play();
   }
 
@@ -222,6 +224,7 @@ class Page {
     let isRunning = true;
     while (isRunning && this._due >= 1 && performance.now() < end) {
       isRunning = this._runs.map((run) => run.advance()).some(Boolean);
+      for (const [i] of this._runs.entries()) this._views[i].follow();
       this._due -= 1;
     }
     this._due = Math.min(this._due, 1); // what a slow computer cannot simulate in time is late
@@ -246,10 +249,14 @@ function say(text) {
   byId("message").textContent = text;
 }
 
-/** What an axis changes at a level. */
-function noteOf({ summary, magnitudes }, level) {
-  const sizes = magnitudes.map(({ unit, levels, what }) => `${levels[level - 1]} ${unit}: ${what}`);
-  return `${summary[0].toUpperCase()}${summary.slice(1)}. ${sizes.join("; ")}.`;
+/** What an axis changes at a level, line by line. */
+function notesOf({ summary, magnitudes }, level) {
+  const size = (value, unit) => {
+    if (unit === "share") return `${Math.round(100 * value)} %`;
+    return unit === "1 = yes" ? (value ? "yes:" : "no:") : `${value} ${unit}`;
+  };
+  const sizes = magnitudes.map(({ unit, levels, what }) => `${size(levels[level - 1], unit)} ${what}`);
+  return [`${summary[0].toUpperCase()}${summary.slice(1)}:`, ...sizes];
 }
 
 async function copy(button, field) {
@@ -278,9 +285,5 @@ async function main() {
 
 main().catch((error) => {
   byId("loading")?.remove();
-  say(
-    error instanceof NoWebGL
-      ? "This browser cannot draw here: it has no WebGL 2, or it is turned off."
-      : `The page could not start. ${error.message}`,
-  );
+  say(`The page could not start. ${error.message}`);
 });

@@ -40,7 +40,7 @@ export class RunView {
     observation.CAMERAS.forEach((camera, i) =>
       this._drawer.draw(run.scene, camera, this._canvases[i], run.episode.sensor),
     );
-    this._follow();
+    this.follow();
     setText(this._part(".instruction"), run.instruction);
     const step = run.steps === 0 ? `at most ${run.maxSteps} steps` : `step ${run.steps} of ${run.maxSteps}`;
     const { judge } = run;
@@ -51,8 +51,8 @@ export class RunView {
     status.className = `status ${judge.isSuccess ? "success" : "failure"}`;
   }
 
-  /** Add to the paths. */
-  _follow() {
+  /** Add to the paths; to be called after each substep. */
+  follow() {
     const { gripperXyz, stoneXyz } = this._run.scene.positions();
     extend(this._gripperPath, gripperXyz.slice(0, 2));
     this._run.episode.stones.forEach(([x, y], i) => {
