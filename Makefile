@@ -97,6 +97,7 @@ docs: $(STAMP)
 	@$(MAKE) --no-print-directory play
 
 play: $(STAMP)
+	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt --group docs
 	@mkdir -p .venv/npm && cp docs/play/package.json .venv/npm
 	@npm install --silent $(NPM_FLAGS) --no-package-lock --no-audit --no-fund --prefix .venv/npm
 	@$(BIN)/python docs/make_play.py site/play

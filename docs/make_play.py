@@ -8,6 +8,7 @@ acts, judges and draws.
 
 import argparse
 import dataclasses
+import gzip
 import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,6 +18,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from play_policy import export
 from tqdm import tqdm
 
 from lerobot_bomb.bomb import board, commands, episode, expert, judge, move, observation
@@ -41,7 +43,16 @@ from lerobot_env_bomb.shared.mujoco_gl import mujoco
 SOURCES = Path(__file__).parent / "play"
 NODE_MODULES = Path(__file__).parents[1] / ".venv" / "npm" / "node_modules"
 MUJOCO = NODE_MODULES / "@mujoco" / "mujoco"
-MUJOCO_FILES = ("mujoco.js", "mujoco.wasm")
+ORT = NODE_MODULES / "onnxruntime-web" / "dist"
+# {where npm has it: its name in the page}
+PACKAGES = {
+    MUJOCO / "mujoco.js": "mujoco.js",
+    MUJOCO / "mujoco.wasm": "mujoco.wasm",
+    ORT / "ort.wasm.bundle.min.mjs": "ort.js",
+    ORT / "ort-wasm-simd-threaded.wasm": "ort.wasm",
+}
+PACKED = (".bin", ".json", ".onnx", ".wasm", ".xml")  # kinds of files that the page unpacks itself
+POLICY = "fdvla"  # of those that come with the package; it acts in suite place
 NUM_SEEDS = 20  # from the first of the protocol's seeds on
 ROBOT = "scara"
 LAYOUT_DIGITS = 9  # of metres: a nanometre
@@ -297,25 +308,44 @@ def write_json(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, separators=(",", ":")))
 
 
-def build(folder: Path, mujoco_folder: Path, seeds: Sequence[int]) -> None:
+def instructions_of(record: Mapping[str, Any]) -> set[str]:
+    """Return all instructions of a suite's record, perturbed ones included."""
+    episodes = [episode for of_task in record["episodes"] for episode in of_task]
+    changes = [change for each in episodes for levels in each["axes"].values() for change in levels]
+    return {text for each in [*episodes, *changes] for text in each.get("instructions", ())}
+
+
+def pack(path: Path) -> None:
+    """Replace a file by a gzipped one."""
+    with gzip.GzipFile(f"{path}.gz", "wb", mtime=0) as packed:
+        packed.write(path.read_bytes())
+    path.unlink()
+
+
+def build(folder: Path, seeds: Sequence[int]) -> None:
     """Write the whole page."""
-    missing = [name for name in MUJOCO_FILES if not (mujoco_folder / name).is_file()]
+    missing = [str(path) for path in PACKAGES if not path.is_file()]
     if missing:
-        raise SystemExit(f"{mujoco_folder} lacks {', '.join(missing)}; `make play` installs it with npm")
+        raise SystemExit(f"There is no {', no '.join(missing)}; `make play` installs it with npm")
     folder.mkdir(parents=True, exist_ok=True)
     for source in SOURCES.iterdir():
         if source.suffix in (".js", ".css", ".html"):
             shutil.copy(source, folder)
-    for name in MUJOCO_FILES:
-        shutil.copy(mujoco_folder / name, folder)
+    for path, name in PACKAGES.items():
+        shutil.copy(path, folder / name)
     write_model(folder)
     exports = [f"export const {name} = {json.dumps(values)};\n" for name, values in constants().items()]
     exports.append(f"export const SEEDS = {json.dumps(list(seeds))};\n")
     exports.append(f"export const SUITES = {json.dumps(list(OWN_SUITES))};\n")
+    exports.append(f"export const POLICY = {json.dumps({'name': POLICY, 'suite': 'place'})};\n")
     (folder / "constants.js").write_text("".join(exports))
     write_json(folder / "noise.json", {str(seed): actuator_noise(seed) for seed in seeds})
-    for suite in OWN_SUITES:
-        write_json(folder / f"{suite}.json", SuiteExport(suite, seeds).record())
+    records = {suite: SuiteExport(suite, seeds).record() for suite in OWN_SUITES}
+    for suite, record in records.items():
+        write_json(folder / f"{suite}.json", record)
+    export(POLICY, instructions_of(records["place"]), folder)
+    for path in [path for path in folder.iterdir() if path.suffix in PACKED]:
+        pack(path)
     size = sum(path.stat().st_size for path in folder.iterdir())
     print(f"Built: {folder / 'index.html'}, {size / 1e6:.1f} MB")
 
@@ -325,9 +355,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="where the page is written")
     parser.add_argument("--seeds", type=int, default=NUM_SEEDS, help="number of seeds of each task")
-    parser.add_argument("--mujoco", type=Path, default=MUJOCO, help="folder of npm's package")
     args = parser.parse_args()
-    build(args.folder, args.mujoco, TEST_SEEDS[: args.seeds])
+    build(args.folder, TEST_SEEDS[: args.seeds])
 
 
 if __name__ == "__main__":

@@ -1,28 +1,36 @@
 """The page that plays BOMB in a browser: its simulation, expert and judge end episodes as Python's do."""
 
+import base64
+import gzip
 import json
 import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import make_play
 import numpy as np
 import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import factory
+from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS, EpisodeSpec, Stage
 from lerobot_bomb.bomb.expert import expert_action
-from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.observation import CAMERAS, RenderOptions
 from lerobot_bomb.bomb.perturbations import AXES
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.bomb.suites import OWN_SUITES
+from lerobot_bomb.checkpoints.shipped import shipped_checkpoint
 from lerobot_env_bomb.bomb.env import BombEnv
 
-MUJOCO = make_play.MUJOCO
 RUNNER = Path(__file__).parent / "fixtures" / "play.mjs"
+ACTOR = RUNNER.with_name("play_policy.mjs")
 VISITOR = RUNNER.with_name("play_in_browser.mjs")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 SEEDS = TEST_SEEDS[:2]
@@ -31,13 +39,17 @@ CLOSE_M = 1e-4  # of a stone's position at the end, in most episodes
 TOLERANCE_M = 4e-4
 
 needs_mujoco = pytest.mark.skipif(
-    shutil.which("node") is None or not (MUJOCO / "mujoco.wasm").is_file(),
-    reason="needs node and npm's @mujoco/mujoco, which `make play` installs",
+    shutil.which("node") is None or not all(path.is_file() for path in make_play.PACKAGES),
+    reason="needs node and npm's packages, which `make play` installs",
 )
 
 needs_browser = pytest.mark.skipif(
     CHROMIUM is None or not (make_play.NODE_MODULES / "playwright-core").is_dir(),
     reason="needs Chromium and npm's playwright-core: make play NPM_FLAGS=--include=dev",
+)
+
+needs_exporter = pytest.mark.skipif(
+    find_spec("onnxscript") is None, reason="needs onnxscript, of `make play`"
 )
 
 
@@ -87,7 +99,7 @@ def in_node(page: Path, jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page with episodes of a few seeds."""
     folder = tmp_path_factory.mktemp("play")
-    make_play.build(folder, MUJOCO, SEEDS)
+    make_play.build(folder, SEEDS)
     return folder
 
 
@@ -192,13 +204,66 @@ def test_failures_have_the_class_that_python_gives(page: Path) -> None:
 @needs_mujoco
 def test_every_task_and_axis_is_there(page: Path) -> None:
     for suite in OWN_SUITES:
-        record = json.loads((page / f"{suite}.json").read_text())
+        record = json.loads(gzip.decompress((page / f"{suite}.json.gz").read_bytes()))
         assert len(record["episodes"]) == find_suite(suite).num_tasks
         for seed, drawn in zip(SEEDS, record["drawn"], strict=True):
             assert drawn == find_suite(suite).sample(EpisodeSpec(seed, suite)).task_id
         for episode in (each for task in record["episodes"] for each in task):
             # every axis changes every episode, at every level
             assert all(all(changes) for axis, changes in episode["axes"].items() if axis != "start")
+
+
+def queries(name: str, seeds: range, max_steps: int) -> tuple[list[dict[str, Any]], np.ndarray]:
+    """Observations of a shipped policy's episodes, and its (N, D) actions."""
+    register_third_party_plugins()
+    path = str(shipped_checkpoint(name))
+    config = PreTrainedConfig.from_pretrained(path)
+    policy = factory.get_policy_class(config.type).from_pretrained(path, config=config)
+    before, after = factory.make_pre_post_processors(config, path)
+    env = BombEnv(EpisodeSpec(0, "place"), RenderOptions(image_size=64))
+    observations, actions = [], []
+    for seed in seeds:
+        policy.reset()
+        observation, _ = env.reset(seed=seed)
+        for step in range(max_steps):
+            images = {camera: observation["pixels"][camera] for camera in CAMERAS}
+            batch = {
+                **{f"observation.images.{each}": to_tensor(image) for each, image in images.items()},
+                "observation.state": torch.from_numpy(observation["agent_pos"])[None],
+                "task": [env.task_description],
+            }
+            with torch.no_grad():
+                action = after(policy.select_action(before(batch)))[0].numpy()
+            rgb = base64.b64encode(np.stack([*images.values()]).tobytes()).decode()
+            state = observation["agent_pos"].tolist()
+            observations.append(
+                {"rgb": rgb, "state": state, "instruction": env.task_description, "step": step}
+            )
+            actions.append(action)
+            observation, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                break
+    env.close()
+    return observations, np.stack(actions)
+
+
+def to_tensor(image: np.ndarray) -> torch.Tensor:
+    """(H, W, 3) uint8 -> (1, 3, H, W) in [0, 1]."""
+    return torch.from_numpy(image).permute(2, 0, 1)[None] / 255
+
+
+@pytest.mark.long
+@needs_mujoco
+@needs_exporter
+def test_the_policy_acts_as_in_python(page: Path) -> None:
+    observations, actions = queries(make_play.POLICY, range(1000, 1014), max_steps=15)
+    assert len(observations) >= 200
+    command = ["node", ACTOR, page]
+    node = subprocess.run(command, input=json.dumps(observations), capture_output=True, text=True, check=True)
+    apart = np.abs(np.array(json.loads(node.stdout)) - actions).max(axis=1)  # in units of 40 mm
+    # a resized pixel that is all but a tie between two grey levels may become the other one
+    assert np.quantile(apart, 0.9) < 1e-4
+    assert apart.max() < 1e-3
 
 
 @pytest.fixture(scope="module")
@@ -233,6 +298,15 @@ def test_a_perturbed_episode_stands_beside_the_clean_one(visit: dict[str, Any]) 
         "--env.task=goal --env.perturbations='[\"dynamics:5\"]' --seed=1001" in visit["compared"]["command"]
     )
     assert len(visit["tabs"]) == 2 and all(each.startswith("Success") for each in visit["tabs"])
+
+
+@pytest.mark.long
+@needs_mujoco
+@needs_browser
+def test_a_shipped_policy_acts_in_the_page(visit: dict[str, Any]) -> None:
+    assert visit["policy"]["outcomes"][1].startswith("Success")  # on the clean scene
+    assert "--policy.path=bomb:fdvla" in visit["policy"]["command"]
+    assert "was trained in suite place" in visit["policy"]["elsewhere"]
 
 
 @pytest.mark.long

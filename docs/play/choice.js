@@ -1,21 +1,23 @@
-// What is shown: suite, seed, task, axis and level, as the page's address and as flags of a command.
-import { SEEDS, SUITES, perturbations } from "./constants.js";
+// What is shown: suite, seed, task, axis, level and who acts, as the page's address and as flags of a command.
+import { POLICY, SEEDS, SUITES, perturbations } from "./constants.js";
 
 const { AXES, MAX_LEVEL } = perturbations;
-export const DEFAULT_CHOICE = { suite: "place", seedPlace: 0, task: null, axis: null, level: 3 };
+export const DEFAULT_CHOICE = { suite: "place", seedPlace: 0, task: null, axis: null, level: 3, policy: null };
+const NAMES = ["suite", "seed", "task", "axis", "level", "policy"];
 
-/** A choice as the part of an address after "#"; task null: the one that the seed draws. */
-export function hashOf({ suite, seedPlace, task, axis, level }) {
+/** A choice as the part of an address after "#"; task null: the seed's; policy null: the expert acts. */
+export function hashOf({ suite, seedPlace, task, axis, level, policy }) {
   const words = [`suite=${suite}`, `seed=${SEEDS[seedPlace]}`];
   if (task !== null) words.push(`task=${task}`);
   if (axis !== null) words.push(`axis=${axis}`, `level=${level}`);
+  if (policy !== null) words.push(`policy=${policy}`);
   return `#${words.join("&")}`;
 }
 
 /** The choice of an address; throws an Error with a message for the visitor. */
 export function choiceOf(hash) {
   const asked = Object.fromEntries(new URLSearchParams(hash.replace(/^#/, "")));
-  const unknown = Object.keys(asked).filter((name) => !["suite", "seed", "task", "axis", "level"].includes(name));
+  const unknown = Object.keys(asked).filter((name) => !NAMES.includes(name));
   if (unknown.length > 0) throw new Error(`The link asks for “${unknown[0].slice(0, 40)}”, which this page does not have.`);
   const oneOf = (name, names) => {
     if (names.includes(asked[name])) return asked[name];
@@ -30,23 +32,31 @@ export function choiceOf(hash) {
   if ("seed" in asked) choice.seedPlace = SEEDS.indexOf(number("seed", SEEDS[0], SEEDS.at(-1)));
   if ("task" in asked) choice.task = number("task", 0, Infinity);
   if ("axis" in asked) choice.axis = oneOf("axis", Object.keys(AXES));
+  if ("policy" in asked) choice.policy = oneOf("policy", [POLICY.name]);
   if ("level" in asked) choice.level = number("level", 1, MAX_LEVEL);
   return choice;
 }
 
 /** The commands that repeat a choice: an evaluation, and a video. */
-export function commandsOf({ suite, seedPlace, task, axis, level }) {
+export function commandsOf({ suite, seedPlace, task, axis, level, policy }) {
   const seed = `--seed=${SEEDS[seedPlace]}`;
   const flags = [`--env.task=${suite}`];
   if (task !== null) flags.push(`--env.task_ids='[${task}]'`);
   const condition = axis === null ? null : `${axis}:${level}`;
+  const checkpoint = `--policy.path=bomb:${policy} --policy.device=cpu`;
   return {
     eval: [
-      "lerobot-eval --policy.type=bomb_expert --env.type=bomb",
+      `lerobot-eval ${policy === null ? "--policy.type=bomb_expert" : checkpoint} --env.type=bomb`,
       ...flags,
       ...(condition ? [`--env.perturbations='["${condition}"]'`] : []),
       `${seed} --eval.n_episodes=1 --eval.batch_size=1`,
     ].join(" "),
-    view: ["lerobot-bomb view", seed, ...flags, ...(condition ? [`--env.perturbations=${condition}`] : [])].join(" "),
+    view: [
+      "lerobot-bomb view",
+      ...(policy === null ? [] : [checkpoint]),
+      seed,
+      ...flags,
+      ...(condition ? [`--env.perturbations=${condition}`] : []),
+    ].join(" "),
   };
 }

@@ -2,7 +2,9 @@
 import { model as built } from "./constants.js";
 import * as meshes from "./meshes.js";
 
-const QUALITY = { slices: 28, stacks: 16, quads: 4 };
+// as finely as MuJoCo draws for people, and for policies
+export const FINE = { slices: 28, stacks: 16, quads: 4, antialias: true };
+export const FAST = { slices: 14, stacks: 8, quads: 2, antialias: false };
 const SHOWN_GROUPS = 3; // geoms of groups 0 to 2 are drawn
 const DEFAULT_RGBA = [0.5, 0.5, 0.5, 1]; // a geom's own colour, unless it is this one, is before its material's
 const NO_MATERIAL = { emission: 0, specular: 0.5, shininess: 0.5, texture: -1 };
@@ -59,17 +61,20 @@ export class NoWebGL extends Error {
 
 export class Drawer {
   /** @param side width and height of what is drawn, in pixels */
-  constructor(mujoco, model, side) {
+  constructor(mujoco, model, side, quality = FINE) {
     this._canvas = document.createElement("canvas");
     this._canvas.width = this._canvas.height = side;
-    const gl = this._canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
+    const gl = this._canvas.getContext("webgl2", {
+      antialias: quality.antialias,
+      preserveDrawingBuffer: true,
+    });
     if (gl === null) throw new NoWebGL();
     this._gl = gl;
     this._program = compile(gl);
     gl.useProgram(this._program);
     this._places = new Map();
     this._meshes = Object.fromEntries(
-      Object.entries(meshes).map(([name, make]) => [name, upload(gl, make(QUALITY))]),
+      Object.entries(meshes).map(([name, make]) => [name, upload(gl, make(quality))]),
     );
     const { mjtGeom } = mujoco;
     this._partOf = new Map(Object.entries(PARTS).map(([type, part]) => [mjtGeom[`mjGEOM_${type}`].value, part]));
@@ -91,6 +96,23 @@ export class Drawer {
    * @param sensor {gains, noise in grey levels} of the camera, or undefined
    */
   draw(scene, camera, canvas, sensor) {
+    this._render(scene, camera, sensor);
+    canvas.getContext("2d").drawImage(this._canvas, 0, 0, canvas.width, canvas.height);
+  }
+
+  /** What a named camera shows: RGBA of its pixels, from the top left. */
+  pixels(scene, camera, sensor) {
+    this._render(scene, camera, sensor);
+    const { width, height } = this._canvas;
+    const upward = new Uint8Array(4 * width * height);
+    this._gl.readPixels(0, 0, width, height, this._gl.RGBA, this._gl.UNSIGNED_BYTE, upward);
+    const lines = [...Array(height).keys()].reverse();
+    const downward = new Uint8Array(upward.length);
+    lines.forEach((line, i) => downward.set(upward.subarray(4 * width * line, 4 * width * (line + 1)), 4 * width * i));
+    return downward;
+  }
+
+  _render(scene, camera, sensor) {
     const { _gl: gl } = this;
     gl.viewport(0, 0, this._canvas.width, this._canvas.height);
     gl.clearColor(0, 0, 0, 1);
@@ -112,7 +134,6 @@ export class Drawer {
     gl.depthMask(false);
     const transparent = shown.filter(({ rgba }) => rgba[3] < OPAQUE);
     for (const geom of [...transparent, ...transparent.reverse()]) this._drawGeom(scene, geom); // twice, as MuJoCo
-    canvas.getContext("2d").drawImage(this._canvas, 0, 0, canvas.width, canvas.height);
   }
 
   _light(model, data, { eye, forward, clipFromWorld }) {

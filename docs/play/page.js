@@ -1,11 +1,13 @@
 // The page: its controls, the loop that simulates and draws, and its messages.
 import { nearestIntersection } from "./board.js";
 import { DEFAULT_CHOICE, choiceOf, commandsOf, hashOf } from "./choice.js";
-import { SEEDS, SUITES, board, episode as rules, perturbations } from "./constants.js";
+import { POLICY, SEEDS, SUITES, board, episode as rules, perturbations } from "./constants.js";
 import { Drawer, pointAt } from "./draw.js";
 import { Run, drawEpisode } from "./episode.js";
+import { readBytes, readJson, readText } from "./files.js";
 import { isOffBoard } from "./judge.js";
 import { BoardMap } from "./map.js";
+import { loadPolicy } from "./policy.js";
 import { RunView } from "./run_view.js";
 import { Scene } from "./scene.js";
 import { placementOf, placementTask, understand } from "./sentence.js";
@@ -14,13 +16,6 @@ const { AXES, MAX_LEVEL } = perturbations;
 const PICTURE_PX = 384;
 const FRAME_MS = 24; // of simulation in one frame, at most
 const byId = (id) => document.getElementById(id);
-
-/** Fetch a file beside the page. */
-async function load(name, read) {
-  const response = await fetch(name);
-  if (!response.ok) throw new Error(`The server answers ${response.status} for ${name}; reload the page.`);
-  return response[read]();
-}
 
 class Page {
   constructor(mujoco, files) {
@@ -56,15 +51,17 @@ class Page {
     fill("suite", SUITES.map((name) => [name, name]));
     fill("seed", SEEDS.map((seed, place) => [place, seed]));
     fill("axis", [["", "none"], ...Object.keys(AXES).map((name) => [name, name.replace("_", " ")])]);
+    fill("policy", [["", "the scripted expert"], [POLICY.name, `the policy bomb:${POLICY.name}`]]);
     byId("level").max = MAX_LEVEL;
   }
 
   _listen() {
     const change = (id, made) =>
       byId(id).addEventListener("input", () => this._tell(() => this._show({ ...this._choice, ...made(byId(id).value) })));
-    change("suite", (suite) => ({ suite, task: null }));
+    change("suite", (suite) => ({ suite, task: null, policy: null }));
     change("seed", (place) => ({ seedPlace: Number(place) }));
     change("task", (task) => ({ task: task === "" ? null : Number(task) }));
+    change("policy", (policy) => ({ policy: policy || null }));
     change("axis", (axis) => ({ axis: axis || null }));
     change("level", (level) => ({ level: Number(level) }));
     byId("sentence-form").addEventListener("submit", (event) => {
@@ -90,19 +87,25 @@ class Page {
   }
 
   async _record(suite) {
-    this._suites[suite] ??= await load(`${suite}.json`, "json");
+    this._suites[suite] ??= await readJson(`${suite}.json`);
     return this._suites[suite];
   }
 
   /** Show the start of an episode. */
   async _show(choice) {
     this._pause();
+    const ticket = (this._ticket = (this._ticket ?? 0) + 1);
     const record = await this._record(choice.suite);
     const numTasks = record.episodes.length;
     if (choice.task !== null && choice.task >= numTasks) {
       throw new Error(`Suite ${choice.suite} has tasks 0 to ${numTasks - 1}; there is no task ${choice.task}.`);
     }
-    if (choice.axis === "dynamics") this._noise ??= await load("noise.json", "json");
+    if (choice.axis === "dynamics") this._noise ??= await readJson("noise.json");
+    if (choice.policy !== null && choice.suite !== POLICY.suite) {
+      throw new Error(`bomb:${POLICY.name} was trained in suite ${POLICY.suite}; here the expert acts.`);
+    }
+    const act = choice.policy === null ? undefined : await this._policy();
+    if (ticket !== this._ticket) return; // the visitor has chosen something else meanwhile
     this._choice = choice;
     const { seedPlace, axis, level } = choice;
     const shown = axis === null ? [null] : [axis, null];
@@ -112,13 +115,29 @@ class Page {
     byId("runs").replaceChildren(...shown.map((_, i) => this._views[i].element));
     this._runs = shown.map((each, i) => {
       const episode = drawEpisode(record, this._task(record), seedPlace, each, level);
-      const run = new Run(this._scenes[i], record, episode, this._noise?.[SEEDS[seedPlace]]);
+      const run = new Run(this._scenes[i], record, episode, this._noise?.[SEEDS[seedPlace]], act);
       const clean = shown.length > 1 ? "Same seed, clean" : `Seed ${SEEDS[seedPlace]}`;
       this._views[i].show(run, each === null ? clean : `Seed ${SEEDS[seedPlace]}, ${each.replace("_", " ")} ${level}`);
       return run;
     });
     this._update(record);
     this._draw();
+  }
+
+  /** How the policy acts; it is fetched when it is first asked for. */
+  async _policy() {
+    if (this._act !== undefined) return this._act;
+    const play = byId("play");
+    play.disabled = true;
+    play.textContent = "Loading the policy: 9 MB …";
+    try {
+      const policy = await loadPolicy(this._mujoco, this._scenes[0].model);
+      this._act = (run) => policy.act(run);
+    } finally {
+      play.disabled = false;
+      this._pause();
+    }
+    return this._act;
   }
 
   _newView() {
@@ -133,7 +152,7 @@ class Page {
 
   /** Write the choice into controls, link and commands. */
   _update(record) {
-    const { suite, seedPlace, task, axis, level } = this._choice;
+    const { suite, seedPlace, task, axis, level, policy } = this._choice;
     const isPlace = suite === "place";
     const label = (number) => {
       if (!isPlace) return record.episodes[number][seedPlace].instructions[0];
@@ -145,6 +164,8 @@ class Page {
     byId("suite").value = suite;
     byId("seed").value = seedPlace;
     byId("task").value = task ?? "";
+    byId("policy").value = policy ?? "";
+    byId("policy").disabled = suite !== POLICY.suite;
     byId("axis").value = axis ?? "";
     byId("level").value = level;
     byId("level").disabled = axis === null;
@@ -214,15 +235,25 @@ class Page {
     byId("play").textContent = hasEnded ? "Play again" : "Play";
   }
 
-  /** Simulate what is due since the last frame, as far as there is time, and draw. */
   _frame(now) {
     if (!this._isPlaying) return;
+    try {
+      this._advance(now);
+    } catch (error) {
+      this._pause();
+      say(`The episode cannot go on. ${error.message}`);
+    }
+  }
+
+  /** Simulate what is due since the last frame, as far as there is time, and draw. */
+  _advance(now) {
     const speed = Number(byId("speed").value);
     this._due += (Math.max(0, now - this._last) / 1000) * rules.PHYSICS_HZ * speed;
     this._last = now;
     const end = performance.now() + FRAME_MS;
     let isRunning = true;
-    while (isRunning && this._due >= 1 && performance.now() < end) {
+    const isWaiting = () => this._runs.some((run) => run.isWaiting);
+    while (isRunning && !isWaiting() && this._due >= 1 && performance.now() < end) {
       isRunning = this._runs.map((run) => run.advance()).some(Boolean);
       for (const [i] of this._runs.entries()) this._views[i].follow();
       this._due -= 1;
@@ -273,13 +304,14 @@ async function copy(button, field) {
 
 async function main() {
   if (typeof WebAssembly !== "object") throw new Error("This browser has no WebAssembly, which MuJoCo needs here.");
-  const [{ default: loadMujoco }, xml, exact, textures] = await Promise.all([
+  const [{ default: loadMujoco }, wasmBinary, xml, exact, textures] = await Promise.all([
     import("./mujoco.js"),
-    load("model.xml", "text"),
-    load("exact.json", "json"),
-    load("textures.bin", "arrayBuffer"),
+    readBytes("mujoco.wasm"),
+    readText("model.xml"),
+    readJson("exact.json"),
+    readBytes("textures.bin"),
   ]);
-  const page = new Page(await loadMujoco(), { xml, exact, textures: new Uint8Array(textures) });
+  const page = new Page(await loadMujoco({ wasmBinary }), { xml, exact, textures });
   await page.start();
 }
 
