@@ -52,7 +52,8 @@ PACKAGES = {
     ORT / "ort-wasm-simd-threaded.wasm": "ort.wasm",
 }
 PACKED = (".bin", ".json", ".onnx", ".wasm", ".xml")  # kinds of files that the page unpacks itself
-POLICY = "fdvla"  # of those that come with the package; it acts in suite place
+# of those that come with the package, and the suite that it was trained in
+POLICY = {"name": "fdvla", "suite": "place"}
 NUM_SEEDS = 20  # from the first of the protocol's seeds on
 ROBOT = "scara"
 LAYOUT_DIGITS = 9  # of metres: a nanometre
@@ -337,13 +338,13 @@ def build(folder: Path, seeds: Sequence[int]) -> None:
     exports = [f"export const {name} = {json.dumps(values)};\n" for name, values in constants().items()]
     exports.append(f"export const SEEDS = {json.dumps(list(seeds))};\n")
     exports.append(f"export const SUITES = {json.dumps(list(OWN_SUITES))};\n")
-    exports.append(f"export const POLICY = {json.dumps({'name': POLICY, 'suite': 'place'})};\n")
+    exports.append(f"export const POLICY = {json.dumps(POLICY)};\n")
     (folder / "constants.js").write_text("".join(exports))
     write_json(folder / "noise.json", {str(seed): actuator_noise(seed) for seed in seeds})
     records = {suite: SuiteExport(suite, seeds).record() for suite in OWN_SUITES}
     for suite, record in records.items():
         write_json(folder / f"{suite}.json", record)
-    export(POLICY, instructions_of(records["place"]), folder)
+    export(POLICY["name"], instructions_of(records[POLICY["suite"]]), folder)
     for path in [path for path in folder.iterdir() if path.suffix in PACKED]:
         pack(path)
     size = sum(path.stat().st_size for path in folder.iterdir())

@@ -24,13 +24,13 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from torch import Tensor, nn
 
 from lerobot_bomb.bomb.observation import CAMERAS, STATE_DIM
+from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.checkpoints.shipped import shipped_checkpoint
 from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep
 from lerobot_policy_bomb.fdvla import modeling_fdvla
 
 INPUTS = ("images", "state", "ids", "mask", "noise")
 NOISE_DIGITS = 7
-MAX_QUERIES = 100
 
 
 class Query(nn.Module):
@@ -88,6 +88,7 @@ def example(query: Query, ids: list[int], num_tokens: int) -> tuple[Tensor, ...]
 @contextmanager
 def traceable(policy: Any) -> Iterator[None]:
     """Replace what looks at numbers while a graph is traced, but is the same in every query."""
+    assert policy.config.crop_fraction == 1, "the whole image"
     backbone = policy.backbone
     visual, side = backbone.vlm.model.visual, backbone.tokens_per_side * backbone._merge
     grid_13 = torch.tensor([[1, side, side]])
@@ -96,7 +97,7 @@ def traceable(policy: Any) -> Iterator[None]:
     constant = {
         (visual, "get_window_index"): lambda _: windows,
         (visual, "rot_pos_emb"): lambda _: angles,
-        (modeling_fdvla, "crop"): lambda images, *_: images,  # of the whole image
+        (modeling_fdvla, "crop"): lambda images, *_: images,
     }
     with ExitStack() as stack:
         stack.enter_context(patch("lerobot_bomb.vlm.inputs.require_finite_batch", lambda *_: None))
@@ -126,7 +127,7 @@ def export(name: str, instructions: set[str], folder: Path) -> None:
     config = query.policy.config
     shape = 1, config.chunk_size, query.policy.action_dim
     noise = []
-    for _ in range(MAX_QUERIES):  # of an episode
+    for _ in range(find_suite(config.environment.task).max_steps):
         noise.append(query.policy._noise(None, shape))
         query.policy._step_noise(shape)
     assert tokenizer_step.tokenizer is not None

@@ -32,7 +32,8 @@ export class Policy {
         for (let pixel = 0; pixel < pixels; pixel++) images[start + pixel] = rgba[4 * pixel + channel] / 255;
       }
     });
-    const tokens = this._tokenizer.encode(run.instruction).slice(0, numTokens);
+    const tokens = this._tokenizer.encode(run.instruction);
+    if (tokens.length > numTokens) throw new Error("The policy cannot read so long an instruction.");
     const noise = record.noise[run.steps];
     const tensor = (type, values, shape) => new ort.Tensor(type, values, shape);
     const { actions } = await this._session.run({
