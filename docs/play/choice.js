@@ -60,3 +60,14 @@ export function commandsOf({ suite, seedPlace, task, axis, level, policy }) {
     ].join(" "),
   };
 }
+
+/** What an axis changes at a level, line by line. */
+export function notesOf(axis, level) {
+  const { summary, magnitudes } = AXES[axis];
+  const size = (value, unit) => {
+    if (unit === "share") return `${Math.round(100 * value)} %`;
+    return unit === "1 = yes" ? (value ? "yes:" : "no:") : `${value} ${unit}`;
+  };
+  const sizes = magnitudes.map(({ unit, levels, what }) => `${size(levels[level - 1], unit)} ${what}`);
+  return [`${summary[0].toUpperCase()}${summary.slice(1)}:`, ...sizes];
+}

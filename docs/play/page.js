@@ -1,6 +1,6 @@
 // The page: its controls, the loop that simulates and draws, and its messages.
 import { nearestIntersection } from "./board.js";
-import { DEFAULT_CHOICE, choiceOf, commandsOf, hashOf } from "./choice.js";
+import { DEFAULT_CHOICE, choiceOf, commandsOf, hashOf, notesOf } from "./choice.js";
 import { POLICY, SEEDS, SUITES, board, episode as rules, perturbations } from "./constants.js";
 import { Drawer, pointAt } from "./draw.js";
 import { Run, drawEpisode } from "./episode.js";
@@ -170,7 +170,7 @@ class Page {
     byId("level").value = level;
     byId("level").disabled = axis === null;
     byId("level-number").textContent = axis === null ? "" : level;
-    const notes = axis === null ? [] : notesOf(AXES[axis], level);
+    const notes = axis === null ? [] : notesOf(axis, level);
     byId("axis-note").replaceChildren(...notes.map((note) => Object.assign(document.createElement("li"), { textContent: note })));
     byId("map-note").textContent = isPlace
       ? "Click, or use the arrow keys and Enter. Stones in the way are drawn anew."
@@ -278,16 +278,6 @@ class Page {
 function say(text) {
   byId("message").hidden = text === "";
   byId("message").textContent = text;
-}
-
-/** What an axis changes at a level, line by line. */
-function notesOf({ summary, magnitudes }, level) {
-  const size = (value, unit) => {
-    if (unit === "share") return `${Math.round(100 * value)} %`;
-    return unit === "1 = yes" ? (value ? "yes:" : "no:") : `${value} ${unit}`;
-  };
-  const sizes = magnitudes.map(({ unit, levels, what }) => `${size(levels[level - 1], unit)} ${what}`);
-  return [`${summary[0].toUpperCase()}${summary.slice(1)}:`, ...sizes];
 }
 
 async function copy(button, field) {
