@@ -2,10 +2,11 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .PHONY: help setup demo demo-train test test-long test-cuda judges neighbours test-lerobot mutants check build \
-	reference docs clean
+	reference docs play clean
 
 BIN := .venv/bin
 STAMP := .venv/.installed
+NPM_FLAGS ?= --omit=dev  # --include=dev: also what tests of the page in a browser need
 # two torch threads beside another job are many times slower than one
 export OMP_NUM_THREADS ?= 1
 # LeRobot imports 4000 files; where this is set, as in many images, every process compiles them anew
@@ -28,6 +29,7 @@ help:
 	@echo "make build      sdist and wheel into dist/, tried in an environment of their own"
 	@echo "make reference  docs/reference/, from the code"
 	@echo "make docs       the documentation as a site, into site/"
+	@echo "make play       the page on which BOMB plays in a browser, into site/play/; needs npm"
 	@echo "make setup      only set up .venv"
 
 setup: $(STAMP)
@@ -92,6 +94,13 @@ docs: $(STAMP)
 	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt --group docs
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "Built: site/index.html"
+	@$(MAKE) --no-print-directory play
+
+play: $(STAMP)
+	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt --group docs
+	@mkdir -p .venv/npm && cp docs/play/package.json .venv/npm
+	@npm install --silent $(NPM_FLAGS) --no-package-lock --no-audit --no-fund --prefix .venv/npm
+	@$(BIN)/python docs/make_play.py site/play
 
 clean:
 	rm -rf .venv

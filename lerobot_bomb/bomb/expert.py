@@ -31,12 +31,21 @@ EMPTY_M = (-0.008, -0.005)  # from the diameter: closed on nothing .. a stone ma
 HELD_SHARE = (0.045, 0.220)  # holds a stone .. does not yet
 OPEN_SHARE = (0.330, 0.720)  # still touches a stone .. is clear of it
 
+# a stone is between the pads: beside, below and above their lower ends
+ENCLOSED_BESIDE_M = (0.008, 0.012)
+ENCLOSED_BELOW_M = (-0.004, -0.002)
+ENCLOSED_ABOVE_M = (0.020, 0.030)
+
 # Approach: over the stone, down a funnel, close.
 HOVER_M = 0.040  # pads above their grasping height while the gripper is off to the side
 FUNNEL_SLOPE = 4.0  # metres of height per metre of lateral error
 FUNNEL_MOUTH_M = 0.003  # lateral error at which the funnel reaches the ground
 CLOSE_LATERAL_M = 0.0060  # lateral error below which the fingers close
 CLOSE_HEIGHT_M = 0.0040  # height above the grasp below which the fingers close
+CLOSE_GAIN = 4.0
+# low fingers do not move sideways, unless near the stone
+FREE_ABOVE_M = (0.006, 0.016)
+FREE_BESIDE_M = (0.005, 0.009)
 
 # Carrying: up, across, down a funnel, release.
 CARRY_M = 0.028  # stone above its resting height; clears stones on the board by more than their height
@@ -46,6 +55,7 @@ CLEARANCE_M = (0.006, 0.013)  # stone's height: creep sideways .. full speed
 CREEP_M = 0.004  # per step of 0.1 s
 RELEASE_LATERAL_M = (0.0040, 0.0070)  # a stone this near is in place: in closed .. in open fingers
 RELEASE_HEIGHT_M = (0.0025, 0.0040)
+RELEASE_SHARE = (0.0, 0.3)  # of these distances, from their ends: not yet .. in place
 SLIDE_M = 0.006  # per step of 0.1 s, of a stone that stays on the board
 
 # Several stones: the next one's turn comes when a stone lies within these distances of its place ..
@@ -150,7 +160,7 @@ def _placed(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
         1 - lateral_m / _between(openness, RELEASE_LATERAL_M),
         1 - height_m / _between(openness, RELEASE_HEIGHT_M),
     )
-    return _ramp(inside, 0.0, 0.3)
+    return _ramp(inside, *RELEASE_SHARE)
 
 
 def _held(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
@@ -168,8 +178,8 @@ def _openness(state: PrivilegedState, shares: tuple[float, float]) -> float:
 def _enclosed(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
     """Return how far the stone is between the pads, in [0, 1]."""
     offset = stone_xyz - state.gripper_xyz
-    beside = 1 - _ramp(float(np.linalg.norm(offset[:2])), 0.008, 0.012)
-    return beside * _ramp(offset[2], -0.004, -0.002) * (1 - _ramp(offset[2], 0.020, 0.030))
+    beside = 1 - _ramp(float(np.linalg.norm(offset[:2])), *ENCLOSED_BESIDE_M)
+    return beside * _ramp(offset[2], *ENCLOSED_BELOW_M) * (1 - _ramp(offset[2], *ENCLOSED_ABOVE_M))
 
 
 def _approach(state: PrivilegedState, stone_xyz: np.ndarray, tempo: float) -> tuple[np.ndarray, float]:
@@ -184,14 +194,14 @@ def _approach(state: PrivilegedState, stone_xyz: np.ndarray, tempo: float) -> tu
     shut_m = HOVER_M * (1 - _openness(state, OPEN_SHARE)) * (1 - enclosed)
     rise_m = max(funnel_m, shut_m) - PRESS_M - above_m
     # away from the stone, low fingers would sweep others off the board: first up, then across
-    freedom = max(_ramp(above_m, 0.006, 0.016), 1 - _ramp(lateral_m, 0.005, 0.009))
+    freedom = max(_ramp(above_m, *FREE_ABOVE_M), 1 - _ramp(lateral_m, *FREE_BESIDE_M))
     motion_m = _step(offset_xy, rise_m, freedom, tempo)
     inside = min(
         1 - lateral_m / CLOSE_LATERAL_M,
         1 - above_m / CLOSE_HEIGHT_M,
         (state.finger_opening - 2 * state.stone_radius_m - EMPTY_M[0]) / CLOSE_HEIGHT_M,
     )
-    return motion_m, float(np.clip(-4 * inside, -1, 1))
+    return motion_m, float(np.clip(-CLOSE_GAIN * inside, -1, 1))
 
 
 def _carry(state: PrivilegedState, stone_xyz: np.ndarray, tempo: float) -> np.ndarray:

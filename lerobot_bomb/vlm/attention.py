@@ -9,8 +9,8 @@ from torch import Tensor
 
 def causal_mask(attention_mask_BL: Tensor) -> Tensor:
     """(B, L) bool -> (B, L, L): a token (row) attends to itself and those before it that are in the mask."""
-    num_tokens = attention_mask_BL.shape[1]
-    causal_LL = torch.ones_like(attention_mask_BL[0]).expand(num_tokens, -1).tril()
+    column_L = torch.arange(attention_mask_BL.shape[1], device=attention_mask_BL.device)
+    causal_LL = column_L[:, None] >= column_L
     return causal_LL & attention_mask_BL[:, None]
 
 

@@ -4,6 +4,7 @@ Shapes: `B` images, `P` patches of an image, `N` patches of all images, `E` feat
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -63,7 +64,7 @@ def embed_patches(visual: Any, patches: Tensor, num_images: int, side: int) -> T
     """
     grid_13 = torch.tensor([[1, side, side]])
     window_index, ends = visual.get_window_index(grid_13)
-    lengths = torch.tensor(ends, dtype=torch.int32).unique_consecutive().diff().tolist()
+    lengths = [end - start for start, end in pairwise(dict.fromkeys(ends))]
     unit = visual.spatial_merge_unit
     order = (window_index[:, None] * unit + torch.arange(unit)).flatten().to(patches.device)
     angles_PE = visual.rot_pos_emb(grid_13)[order].repeat(num_images, 2)

@@ -53,8 +53,8 @@ STONE_RGBA = {True: (0.96, 0.96, 0.93, 1.0), False: (0.06, 0.06, 0.07, 1.0)}  # 
 HIDDEN = 0.0  # opacity of geoms that only a perturbation or a pattern shows
 
 
-def compile_scene(robot: Robot) -> mujoco.MjModel:
-    """Compile the scene; every episode reuses the result."""
+def scene_spec(robot: Robot) -> mujoco.MjSpec:
+    """Describe the scene, with textures that are still to be painted."""
     spec = robot.load()
     _add_board(spec)
     _add_tray(spec)
@@ -63,7 +63,12 @@ def compile_scene(robot: Robot) -> mujoco.MjModel:
     _add_pattern(spec)
     for index in range(NUM_STONES):
         _add_stone(spec, index)
-    model = spec.compile()
+    return spec
+
+
+def compile_scene(robot: Robot) -> mujoco.MjModel:
+    """Compile the scene; every episode reuses the result."""
+    model = scene_spec(robot).compile()
     # Painted after compilation: handing the pixels to MjSpec one by one takes a second.
     _paint(model, "board", board_texture())
     for pattern in TABLE_PATTERNS:

@@ -35,7 +35,11 @@ class PerturbedEpisode(Episode):
 
 def sample_episode(spec: EpisodeSpec) -> PerturbedEpisode:
     """Draw the suite's episode, then its perturbation; the same spec gives the same episode."""
-    nominal = find_suite(spec.suite).sample(spec)
+    return perturb(find_suite(spec.suite).sample(spec))
+
+
+def perturb(nominal: Episode) -> PerturbedEpisode:
+    """Draw the perturbation of an episode's condition, and apply it to instruction and layout."""
     perturbation = draw_perturbation(nominal)
     changed = {
         "turns": tuple(

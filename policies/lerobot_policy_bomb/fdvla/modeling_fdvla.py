@@ -431,7 +431,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
             return (index_L == attention_mask_BL.shape[1] - 1).expand_as(attention_mask_BL)
         span = self.layout.spans(len(index_L))[INSTRUCTION]
         instruction_BL = attention_mask_BL & (index_L >= span.start) & (index_L < span.stop)
-        return torch.where(instruction_BL.any(dim=1, keepdim=True), instruction_BL, attention_mask_BL)
+        return instruction_BL | (attention_mask_BL & ~instruction_BL.any(dim=1, keepdim=True))
 
     def embed(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
         """Embed a batch's prompts, (B, L, H), image features and state in place."""

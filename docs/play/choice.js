@@ -1,0 +1,73 @@
+// What is shown: suite, seed, task, axis, level and who acts, as the page's address and as flags of a command.
+import { POLICY, SEEDS, SUITES, perturbations } from "./constants.js";
+
+const { AXES, MAX_LEVEL } = perturbations;
+export const DEFAULT_CHOICE = { suite: "place", seedPlace: 0, task: null, axis: null, level: 3, policy: null };
+const NAMES = ["suite", "seed", "task", "axis", "level", "policy"];
+
+/** A choice as the part of an address after "#"; task null: the seed's; policy null: the expert acts. */
+export function hashOf({ suite, seedPlace, task, axis, level, policy }) {
+  const words = [`suite=${suite}`, `seed=${SEEDS[seedPlace]}`];
+  if (task !== null) words.push(`task=${task}`);
+  if (axis !== null) words.push(`axis=${axis}`, `level=${level}`);
+  if (policy !== null) words.push(`policy=${policy}`);
+  return `#${words.join("&")}`;
+}
+
+/** The choice of an address; throws an Error with a message for the visitor. */
+export function choiceOf(hash) {
+  const asked = Object.fromEntries(new URLSearchParams(hash.replace(/^#/, "")));
+  const unknown = Object.keys(asked).filter((name) => !NAMES.includes(name));
+  if (unknown.length > 0) throw new Error(`The link asks for “${unknown[0].slice(0, 40)}”, which this page does not have.`);
+  const oneOf = (name, names) => {
+    if (names.includes(asked[name])) return asked[name];
+    throw new Error(`The link asks for ${name} “${asked[name].slice(0, 40)}”; there are ${names.join(", ")}.`);
+  };
+  const number = (name, low, high) => {
+    if (/^\d+$/.test(asked[name]) && asked[name] >= low && asked[name] <= high) return Number(asked[name]);
+    throw new Error(`The link asks for ${name} “${asked[name].slice(0, 40)}”; it goes from ${low} to ${high}.`);
+  };
+  const choice = { ...DEFAULT_CHOICE };
+  if ("suite" in asked) choice.suite = oneOf("suite", SUITES);
+  if ("seed" in asked) choice.seedPlace = SEEDS.indexOf(number("seed", SEEDS[0], SEEDS.at(-1)));
+  if ("task" in asked) choice.task = number("task", 0, Infinity);
+  if ("axis" in asked) choice.axis = oneOf("axis", Object.keys(AXES));
+  if ("policy" in asked) choice.policy = oneOf("policy", [POLICY.name]);
+  if ("level" in asked) choice.level = number("level", 1, MAX_LEVEL);
+  return choice;
+}
+
+/** The commands that repeat a choice: an evaluation, and a video. */
+export function commandsOf({ suite, seedPlace, task, axis, level, policy }) {
+  const seed = `--seed=${SEEDS[seedPlace]}`;
+  const flags = [`--env.task=${suite}`];
+  if (task !== null) flags.push(`--env.task_ids='[${task}]'`);
+  const condition = axis === null ? null : `${axis}:${level}`;
+  const checkpoint = `--policy.path=bomb:${policy} --policy.device=cpu`;
+  return {
+    eval: [
+      `lerobot-eval ${policy === null ? "--policy.type=bomb_expert" : checkpoint} --env.type=bomb`,
+      ...flags,
+      ...(condition ? [`--env.perturbations='["${condition}"]'`] : []),
+      `${seed} --eval.n_episodes=1 --eval.batch_size=1`,
+    ].join(" "),
+    view: [
+      "lerobot-bomb view",
+      ...(policy === null ? [] : [checkpoint]),
+      seed,
+      ...flags,
+      ...(condition ? [`--env.perturbations=${condition}`] : []),
+    ].join(" "),
+  };
+}
+
+/** What an axis changes at a level, line by line. */
+export function notesOf(axis, level) {
+  const { summary, magnitudes } = AXES[axis];
+  const size = (value, unit) => {
+    if (unit === "share") return `${Math.round(100 * value)} %`;
+    return unit === "1 = yes" ? (value ? "yes:" : "no:") : `${value} ${unit}`;
+  };
+  const sizes = magnitudes.map(({ unit, levels, what }) => `${size(levels[level - 1], unit)} ${what}`);
+  return [`${summary[0].toUpperCase()}${summary.slice(1)}:`, ...sizes];
+}
