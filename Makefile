@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .PHONY: help setup demo demo-train test test-long test-cuda judges neighbours test-lerobot mutants check build \
-	reference docs play clean
+	reference docs npm play clean
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -96,10 +96,13 @@ docs: $(STAMP)
 	@echo "Built: site/index.html"
 	@$(MAKE) --no-print-directory play
 
-play: $(STAMP)
-	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt --group docs
+# MuJoCo's WASM and what else a page of JavaScript needs
+npm: $(STAMP)
 	@mkdir -p .venv/npm && cp docs/play/package.json .venv/npm
 	@npm install --silent $(NPM_FLAGS) --no-package-lock --no-audit --no-fund --prefix .venv/npm
+
+play: $(STAMP) npm
+	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt --group docs
 	@$(BIN)/python docs/make_play.py site/play
 
 clean:

@@ -40,7 +40,7 @@ TOLERANCE_M = 4e-4
 
 needs_mujoco = pytest.mark.skipif(
     shutil.which("node") is None or not all(path.is_file() for path in make_play.PACKAGES),
-    reason="needs node and npm's packages, which `make play` installs",
+    reason="needs node and npm's packages, which `make npm` installs",
 )
 
 needs_browser = pytest.mark.skipif(
