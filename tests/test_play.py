@@ -66,7 +66,7 @@ def play(
     level: int,
     act: Callable[[PrivilegedState], np.ndarray] = expert_action,
 ) -> dict[str, Any]:
-    """How an episode ends in Python, and its actions."""
+    """Play an episode in Python; return how it ends, and its actions."""
     spec = find_suite(suite).of_task(EpisodeSpec(seed, suite), task)
     spec = replace(spec, perturbations="none" if axis is None else f"{axis}:{level}")
     env = BombEnv(spec, RenderOptions(image_size=32))
@@ -89,7 +89,7 @@ def play(
 
 
 def in_node(page: Path, jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """How episodes end in JavaScript."""
+    """Play episodes in JavaScript; return how they end."""
     command = ["node", RUNNER, page]
     node = subprocess.run(command, input=json.dumps(jobs), capture_output=True, text=True, check=True)
     return json.loads(node.stdout)
@@ -268,7 +268,7 @@ def test_the_policy_acts_as_in_python(page: Path) -> None:
 
 @pytest.fixture(scope="module")
 def visit(page: Path) -> dict[str, Any]:
-    """What the page shows to a visitor who tries all of it."""
+    """Try all of the page as a visitor; return what it shows."""
     command = ["node", VISITOR, page, make_play.NODE_MODULES, str(CHROMIUM)]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
