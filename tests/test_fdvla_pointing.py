@@ -98,6 +98,13 @@ def test_metrics_tell_which_places_and_stones_are_read() -> None:
     assert metrics["place_accuracy"] == 0.25 and metrics["spot_accuracy"] == 0.5
 
 
+def test_it_points_in_bfloat16() -> None:
+    policy = pointing_policy(dtype="bfloat16")
+    loss, metrics = policy(pointing_batch(policy))
+    loss.backward()
+    assert torch.isfinite(loss) and metrics["stone_loss"] > 0
+
+
 def test_labels_are_of_training_only() -> None:
     policy = pointing_policy()
     policy.predict_action_chunk(make_batch(policy, 2))

@@ -134,7 +134,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         with self.autocast(), second_derivatives(self.config.has_energy):
             if self.config.has_energy:
                 point.actions.requires_grad_()
-            context, pointed, features_BPH = self._read_and_point(batch, labels)
+            context, pointing, read, features_BPH = self._read_and_point(batch, labels)
             heads = self._heads(context, loss_mask_BK)
             predicted = velocity_BKD, noise_BKD = heads(point.actions, point.tau)
             loss, terms = self._joint_loss(
@@ -150,16 +150,12 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
             loss = loss.unflatten(0, (-1, draws)).mean(dim=1)
         elif self.training:
             loss = weighed(loss, loss_mask_BK)
-        parts: Parts = {}
-        if self.pointer is not None and pointed is not None and labels is not None:
-            for name, loss_B in self.pointer.losses(pointed, labels).items():
-                loss = plus(loss, self.config.pointing_loss_weight, loss_B)
-                terms[name] = loss_B.detach().mean()
-            parts = self.pointer.parts(pointed, labels)
+        for name, loss_B in pointing.items():
+            loss = plus(loss, self.config.pointing_loss_weight, loss_B)
+            terms[name] = loss_B.detach().mean()
         loss, board = self._with_board(loss, batch, features_BPH)
-        parts |= board
         return loss, self._metrics(
-            loss, terms, parts, velocity_BKD, noise_BKD, point, actions_BKD, loss_mask_BK
+            loss, terms, read | board, velocity_BKD, noise_BKD, point, actions_BKD, loss_mask_BK
         )
 
     def _joint_loss(
@@ -194,18 +190,19 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
 
     def _read_and_point(
         self, batch: dict[str, Tensor], labels: Labels | None
-    ) -> tuple[Context, Pointed | None, Tensor]:
-        """Return the context with the places that the heads are given, and what the policy points at.
+    ) -> tuple[Context, dict[str, Tensor], Parts, Tensor]:
+        """Return the context with the places that the heads are given, losses (B,) of pointing, what is read.
 
         Also return image features (B, P, H), P of all cameras, as the language model reads them.
         """
         context, embeds_BLH = self._read_embeds(batch)
         features_BPH = embeds_BLH[:, self.layout.image_columns(embeds_BLH.device)]
         if self.pointer is None or labels is None:
-            return context, None, features_BPH
+            return context, {}, {}, features_BPH
         pointed = self._point(context, self._of_batch(batch, OBS_STATE))
         context = replace(context, feedback=self.pointer.feed_back(pointed, labels.given))
-        return context, pointed, features_BPH
+        losses, right = self.pointer.losses(pointed, labels), self.pointer.parts(pointed, labels)
+        return context, losses, right, features_BPH
 
     def _actions(self, batch: dict[str, Tensor]) -> Tensor:
         """Read actions (B, K, D) as the heads predict them: normalised, and relative if configured."""
@@ -230,9 +227,9 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         actions_BKD: Tensor,
         loss_mask_BK: Tensor,
     ) -> dict[str, float]:
-        """Return loss terms, what was read, and errors of the actions that A^tau and a head imply.
+        """Return loss terms, what is read right, and errors of the actions that A^tau and a head imply.
 
-        Errors are known only with a dataset, that is in training. Padded actions do not count.
+        Errors are in the data's units, and known only with a dataset. Padded actions do not count.
         """
         parts = {name: (term, torch.ones_like(term, dtype=torch.bool)) for name, term in terms.items()}
         limits = self.config.denoise_tau_min, self.config.clip_sample_range
