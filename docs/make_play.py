@@ -142,8 +142,8 @@ def pack(path: Path) -> None:
     path.unlink()
 
 
-def build(folder: Path, seeds: Sequence[int]) -> None:
-    """Write the whole page."""
+def build(folder: Path, seeds: Sequence[int], *, with_policy: bool = True) -> None:
+    """Write the whole page; a policy's graph needs onnxscript, of the group `docs`."""
     missing = [str(path) for path in PACKAGES if not path.is_file()]
     if missing:
         raise SystemExit(f"There is no {', no '.join(missing)}; `make play` installs it with npm")
@@ -163,7 +163,8 @@ def build(folder: Path, seeds: Sequence[int]) -> None:
     records = {suite: SuiteExport(suite, seeds).record() for suite in OWN_SUITES}
     for suite, record in records.items():
         write_json(folder / f"{suite}.json", record)
-    export(POLICY["name"], instructions_of(records[POLICY["suite"]]), folder)
+    if with_policy:
+        export(POLICY["name"], instructions_of(records[POLICY["suite"]]), folder)
     for path in [path for path in folder.iterdir() if path.suffix in PACKED]:
         pack(path)
     size = sum(path.stat().st_size for path in folder.iterdir())

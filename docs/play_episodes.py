@@ -145,10 +145,8 @@ class SuiteExport:
         tasks = tqdm(range(suite.num_tasks), desc=self.suite)
         episodes = [[self._episode(task, seed) for seed in self.seeds] for task in tasks]
         return {
-            "suite": self.suite,
             "max_steps": suite.max_steps,
             "num_goals": suite.num_goals,
-            "version": suite.version,
             # the task that a seed draws where none is asked for
             "drawn": [suite.sample(EpisodeSpec(seed, self.suite)).task_id for seed in self.seeds],
             "episodes": episodes,

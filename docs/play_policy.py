@@ -11,8 +11,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from lerobot.configs import PreTrainedConfig
-from lerobot.policies import factory
+from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import (
     ACTION,
     OBS_IMAGES,
@@ -20,12 +19,13 @@ from lerobot.utils.constants import (
     OBS_LANGUAGE_TOKENS,
     OBS_STATE,
 )
-from lerobot.utils.import_utils import register_third_party_plugins
 from torch import Tensor, nn
 
 from lerobot_bomb.bomb.observation import CAMERAS, STATE_DIM
 from lerobot_bomb.bomb.suite import find_suite
+from lerobot_bomb.checkpoints.folder import Postprocessor, Preprocessor, load_processors, read_config
 from lerobot_bomb.checkpoints.shipped import shipped_checkpoint
+from lerobot_bomb.evaluation.predictions import load_network
 from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep
 from lerobot_policy_bomb.fdvla import modeling_fdvla
 
@@ -41,9 +41,10 @@ class Query(nn.Module):
     action_mean: Tensor
     action_std: Tensor
 
-    def __init__(self, policy: Any, normalizer: Any, unnormalizer: Any):
+    def __init__(self, policy: Any, before: Any, after: Any):
         super().__init__()
         self.policy = policy
+        normalizer, unnormalizer = before.steps[-1], after.steps[0]
         self._eps = normalizer.eps
         for name, step, key in (("state", normalizer, OBS_STATE), ("action", unnormalizer, ACTION)):
             for statistic in ("mean", "std"):
@@ -62,15 +63,10 @@ class Query(nn.Module):
         return actions_1KD[0] * self.action_std + self.action_mean
 
 
-def load(name: str) -> tuple[Query, TaskTokenizerStep]:
-    """Load a shipped policy that does not point, and the tokenizer of its instructions."""
-    register_third_party_plugins()
-    path = str(shipped_checkpoint(name))
-    config = PreTrainedConfig.from_pretrained(path)
-    policy: Any = factory.get_policy_class(config.type).from_pretrained(path, config=config)
-    before, after = factory.make_pre_post_processors(config, path)
-    tokenizer_step = next(step for step in before.steps if isinstance(step, TaskTokenizerStep))
-    return Query(policy, before.steps[-1], after.steps[0]).eval(), tokenizer_step
+def load(name: str) -> tuple[PreTrainedPolicy, Preprocessor, Postprocessor]:
+    """Load a shipped policy and its processors."""
+    config = read_config(shipped_checkpoint(name), "cpu")
+    return load_network(config), *load_processors(config)
 
 
 def example(query: Query, ids: list[int], num_tokens: int) -> tuple[Tensor, ...]:
@@ -107,8 +103,10 @@ def traceable(policy: Any) -> Iterator[None]:
 
 
 def export(name: str, instructions: set[str], folder: Path) -> None:
-    """Write graph and `policy.json` of a policy that can read all these instructions."""
-    query, tokenizer_step = load(name)
+    """Write graph and `policy.json` of a policy that does not point and can read all these instructions."""
+    policy, before, after = load(name)
+    query = Query(policy, before, after).eval()
+    tokenizer_step: Any = next(step for step in before.steps if isinstance(step, TaskTokenizerStep))
     longest = max((tokenizer_step._ids_of(text).tolist() for text in instructions), key=len)
     inputs = example(query, longest, len(longest))
     with torch.no_grad(), traceable(query.policy):
@@ -133,8 +131,6 @@ def export(name: str, instructions: set[str], folder: Path) -> None:
     assert tokenizer_step.tokenizer is not None
     model = json.loads(tokenizer_step.tokenizer.to_str())["model"]
     record = {
-        "name": name,
-        "suite": config.environment.task,
         "image_size": config.environment.image_size,
         "num_tokens": len(longest),
         "vocab": model["vocab"],

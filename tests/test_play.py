@@ -15,9 +15,7 @@ import make_play
 import numpy as np
 import pytest
 import torch
-from lerobot.configs import PreTrainedConfig
-from lerobot.policies import factory
-from lerobot.utils.import_utils import register_third_party_plugins
+from play_policy import load
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS, EpisodeSpec, Stage
 from lerobot_bomb.bomb.expert import expert_action
@@ -26,7 +24,6 @@ from lerobot_bomb.bomb.perturbations import AXES
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.bomb.suites import OWN_SUITES
-from lerobot_bomb.checkpoints.shipped import shipped_checkpoint
 from lerobot_env_bomb.bomb.env import BombEnv
 
 RUNNER = Path(__file__).parent / "fixtures" / "play.mjs"
@@ -43,13 +40,13 @@ needs_mujoco = pytest.mark.skipif(
     reason="needs node and npm's packages, which `make npm` installs",
 )
 
-needs_browser = pytest.mark.skipif(
-    CHROMIUM is None or not (make_play.NODE_MODULES / "playwright-core").is_dir(),
-    reason="needs Chromium and npm's playwright-core: make play NPM_FLAGS=--include=dev",
-)
+HAS_EXPORTER = find_spec("onnxscript") is not None
 
-needs_exporter = pytest.mark.skipif(
-    find_spec("onnxscript") is None, reason="needs onnxscript, of `make play`"
+needs_exporter = pytest.mark.skipif(not HAS_EXPORTER, reason="needs onnxscript, of `make play`")
+
+needs_browser = pytest.mark.skipif(
+    CHROMIUM is None or not HAS_EXPORTER or not (make_play.NODE_MODULES / "playwright-core").is_dir(),
+    reason="needs Chromium, onnxscript and npm's playwright-core: make play NPM_FLAGS=--include=dev",
 )
 
 
@@ -99,7 +96,7 @@ def in_node(page: Path, jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page with episodes of a few seeds."""
     folder = tmp_path_factory.mktemp("play")
-    make_play.build(folder, SEEDS)
+    make_play.build(folder, SEEDS, with_policy=HAS_EXPORTER)
     return folder
 
 
@@ -215,11 +212,7 @@ def test_every_task_and_axis_is_there(page: Path) -> None:
 
 def queries(name: str, seeds: range, max_steps: int) -> tuple[list[dict[str, Any]], np.ndarray]:
     """Observations of a shipped policy's episodes, and its (N, D) actions."""
-    register_third_party_plugins()
-    path = str(shipped_checkpoint(name))
-    config = PreTrainedConfig.from_pretrained(path)
-    policy = factory.get_policy_class(config.type).from_pretrained(path, config=config)
-    before, after = factory.make_pre_post_processors(config, path)
+    policy, before, after = load(name)
     env = BombEnv(EpisodeSpec(0, "place"), RenderOptions(image_size=64))
     observations, actions = [], []
     for seed in seeds:

@@ -3,7 +3,7 @@ import { model as built } from "./constants.js";
 import * as meshes from "./meshes.js";
 
 // as finely as MuJoCo draws for people, and for policies
-export const FINE = { slices: 28, stacks: 16, quads: 4, antialias: true };
+const FINE = { slices: 28, stacks: 16, quads: 4, antialias: true };
 export const FAST = { slices: 14, stacks: 8, quads: 2, antialias: false };
 const SHOWN_GROUPS = 3; // geoms of groups 0 to 2 are drawn
 const DEFAULT_RGBA = [0.5, 0.5, 0.5, 1]; // a geom's own colour, unless it is this one, is before its material's
@@ -53,7 +53,7 @@ void main() {
 }`;
 
 /** Thrown where a browser has no WebGL 2. */
-export class NoWebGL extends Error {
+class NoWebGL extends Error {
   constructor() {
     super("This browser cannot draw here: it has no WebGL 2, or it is turned off.");
   }

@@ -84,7 +84,7 @@ export class Run {
 }
 
 /** The expert's action. Observations and actions are float32, as between Python's policy and environment. */
-export function actAsExpert({ judge, now, actuator }) {
+function actAsExpert({ judge, now, actuator }) {
   const state = {
     gripperXyz: now.gripperXyz.map(Math.fround),
     fingerOpening: Math.fround(now.fingerOpening),

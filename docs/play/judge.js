@@ -30,10 +30,6 @@ export class Judge {
     this._restSteps = STONES.map(() => 0);
   }
 
-  get stone() {
-    return this._stone;
-  }
-
   get numMade() {
     return Math.max(...this._plans.map(({ made }) => made.size)) + this._isComplete;
   }

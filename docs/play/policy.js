@@ -4,7 +4,7 @@ import { Drawer, FAST } from "./draw.js";
 import { readBytes, readJson } from "./files.js";
 import { Tokenizer } from "./tokenizer.js";
 
-export class Policy {
+class Policy {
   /**
    * @param ort the module of npm's onnxruntime-web
    * @param session of the policy's graph
@@ -47,6 +47,14 @@ export class Policy {
   }
 }
 
+/** Begin a session of a policy's graph; files {wasm, graph, record}; `look` as a Policy takes it. */
+export async function openPolicy(ort, { wasm, graph, record }, look) {
+  ort.env.wasm.numThreads = 1; // more need headers that a static host does not send
+  ort.env.wasm.wasmBinary = wasm.buffer;
+  const session = await ort.InferenceSession.create(graph, { executionProviders: ["wasm"] });
+  return new Policy(ort, session, record, look);
+}
+
 /** Fetch the policy, with what runs it and eyes for it. */
 export async function loadPolicy(mujoco, model) {
   const [ort, wasm, graph, record] = await Promise.all([
@@ -55,9 +63,6 @@ export async function loadPolicy(mujoco, model) {
     readBytes("policy.onnx"),
     readJson("policy.json"),
   ]);
-  ort.env.wasm.numThreads = 1; // more need headers that a static host does not send
-  ort.env.wasm.wasmBinary = wasm.buffer;
-  const session = await ort.InferenceSession.create(graph, { executionProviders: ["wasm"] });
   const eyes = new Drawer(mujoco, model, record.image_size, FAST);
-  return new Policy(ort, session, record, (...seen) => eyes.pixels(...seen));
+  return openPolicy(ort, { wasm, graph, record }, (...seen) => eyes.pixels(...seen));
 }

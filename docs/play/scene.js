@@ -141,12 +141,6 @@ export class Scene {
       model.body_gravcomp[this._bodies[i]] = 1;
     });
   }
-
-  /** Free the WASM's memory. */
-  delete() {
-    this.data.delete();
-    this.model.delete();
-  }
 }
 
 /** Turns actions into the gripper's command; late and imprecise under the axis `dynamics`. */

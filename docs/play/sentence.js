@@ -2,7 +2,7 @@
 import { BOARD, isOnBoard } from "./board.js";
 import { board, place } from "./constants.js";
 
-export const MAX_LENGTH = 300;
+const MAX_LENGTH = 300;
 const TEMPLATES = [...place.TEMPLATES, ...place.FORMS.flat()].map(compile);
 // of a sentence in free words; any other word could change what "row" and "column" mean
 const PLAIN_WORDS = new Set(
