@@ -33,8 +33,8 @@ class Demonstrations:
     ) -> "Demonstrations":
         """Read these episodes; mean and range are of all of them if none is a training episode."""
         shapes = [tuple(meta.features.get(key, {}).get("shape", ())) for key in (ACTION, OBS_STATE)]
-        states = [OBS_STATE] if shapes[0] == shapes[1] else []
-        columns = read_columns(meta, [ACTION, *states, *({DONE} & {*meta.features})], episodes)
+        keys = [ACTION, OBS_STATE] if shapes[0] == shapes[1] else [ACTION]
+        columns = read_columns(meta, [*keys, DONE] if DONE in meta.features else keys, episodes)
         return cls(
             actions=columns[ACTION].astype(np.float64),
             states=columns[OBS_STATE].astype(np.float64) if OBS_STATE in columns else None,
