@@ -43,7 +43,7 @@ $(STAMP): pyproject.toml constraints.txt lerobot_bomb/__init__.py
 		{ echo "Creating .venv with $$python"; "$$python" -m venv --clear .venv || exit 1; }
 	@if [ ! -x $(BIN)/uv ]; then echo "Installing uv into .venv"; $(BIN)/python -m pip install -q uv || exit 1; fi
 	@echo "Installing packages under constraints.txt"
-	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt -e '.[pusht,libero,sapien]' --group dev
+	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt -e '.[pusht,libero,sapien,so101]' --group dev
 	@touch $@
 
 demo: setup

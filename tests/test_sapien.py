@@ -20,9 +20,9 @@ from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.comparison import compare
 from lerobot_bomb.results.groups import groups_of
 from lerobot_bomb.results.reading import read_records
+from lerobot_env_bomb.bomb.hand import PAD_SIDES
 from lerobot_env_bomb.bomb.model import stone_name
 from lerobot_env_bomb.bomb.perturb import sample_episode
-from lerobot_env_bomb.bomb.robots import PAD_SIDES
 from lerobot_env_bomb.bomb.scene import Scene
 
 SPEC = EpisodeSpec(seed=1000, simulator="sapien")

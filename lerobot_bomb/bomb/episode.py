@@ -15,9 +15,9 @@ from lerobot_bomb.flags import one_of
 # policy and tasks. A suite has a version of its own, for its episodes: `bomb/suite.py`.
 PROTOCOL_VERSION = "1.1"
 
-ROBOTS = ("scara", "fetch")
+ROBOTS = ("scara", "fetch", "so101")
 SIMULATORS = ("mujoco", "sapien")  # of the physics
-CONTROL_MODES = ("relative", "absolute")
+CONTROL_MODES = ("relative", "absolute", "joints")  # the last one: of the robot so101
 SPLITS = ("all", "train", "heldout")
 
 DEFAULT_FPS = 10  # control steps per second
@@ -98,6 +98,10 @@ class EpisodeSpec(PerturbedSpec):
         one_of("--env.simulator", self.simulator, SIMULATORS)
         one_of("--env.split", self.split, SPLITS)
         one_of("--env.control_mode", self.control_mode, CONTROL_MODES)
+        if self.control_mode == "joints" and self.robot != "so101":
+            raise ValueError(
+                f"--env.control_mode=joints commands the joints of --env.robot=so101, not of {self.robot}"
+            )
         check_seed(self.seed)
         if not (0 < self.fps <= PHYSICS_HZ and PHYSICS_HZ % self.fps == 0):
             divisors = [n for n in range(1, PHYSICS_HZ + 1) if PHYSICS_HZ % n == 0]

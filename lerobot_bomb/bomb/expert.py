@@ -11,6 +11,7 @@ from operator import add
 
 import numpy as np
 
+from lerobot_bomb.bomb import so101
 from lerobot_bomb.bomb.episode import DEFAULT_FPS
 from lerobot_bomb.bomb.observation import MAX_STEP_M, WORKSPACE_HIGH_M, WORKSPACE_LOW_M
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
@@ -65,11 +66,16 @@ REACHED_HEIGHT_M = (0.0030, 0.0050)
 OFF_ABOVE_M = (0.008, 0.016)
 OFF_BESIDE_M = (0.022, 0.032)
 
+# Gripper command between which the jaw of control mode `joints` closes; elsewhere it closes below 0.
+JAW_COMMAND = (-0.2, 0.2)
+JAW_SQUEEZE_M = 0.004  # that closed jaws are commanded to be nearer to the grip point than a stone lets them
+
 
 def expert_action(state: PrivilegedState) -> np.ndarray:
-    """(4,) float32 action that brings each goal's stone to its place, in the control mode of the state.
+    """(D,) float32 action that brings each goal's stone to its place, in the control mode of the state.
 
-    Relative: units of `MAX_STEP_M`, within [-1, 1]; absolute: metres within the workspace.
+    Relative: units of `MAX_STEP_M`, within [-1, 1]; absolute: metres within the workspace; joints: degrees,
+    the jaw's in percent.
     """
     tempo = DEFAULT_FPS / state.fps
     motions_m, grippers = [], []
@@ -78,12 +84,13 @@ def expert_action(state: PrivilegedState) -> np.ndarray:
         motions_m.append(share * motion_m)
         grippers.append(share * gripper)
     motion_m, gripper = reduce(add, motions_m), reduce(add, grippers)
+    if state.control_mode == "relative":
+        return np.array([*np.clip(motion_m / MAX_STEP_M, -1, 1), gripper], dtype=np.float32)
+    gripper_xyz = state.gripper_xyz + state.pending_motion_m
+    xyz = np.clip(gripper_xyz + motion_m, WORKSPACE_LOW_M, WORKSPACE_HIGH_M)
     if state.control_mode == "absolute":
-        gripper_xyz = state.gripper_xyz + state.pending_motion_m
-        xyz = np.clip(gripper_xyz + motion_m, WORKSPACE_LOW_M, WORKSPACE_HIGH_M)
-    else:
-        xyz = np.clip(motion_m / MAX_STEP_M, -1, 1)
-    return np.array([*xyz, gripper], dtype=np.float32)
+        return np.array([*xyz, gripper], dtype=np.float32)
+    return _joints(state, xyz, gripper)
 
 
 def current_goal(state: PrivilegedState) -> Goal:
@@ -94,6 +101,18 @@ def current_goal(state: PrivilegedState) -> Goal:
 def held_share(state: PrivilegedState, stone: int) -> float:
     """Return how firmly the fingers hold a stone, in [0, 1]."""
     return _held(state, state.stone_xyz[stone])
+
+
+def _joints(state: PrivilegedState, gripper_xyz: np.ndarray, gripper: float) -> np.ndarray:
+    """(6,) float32: joints that bring the gripper there, with the jaw at a gripper command in [-1, 1]."""
+    squeezed_m = state.stone_radius_m - JAW_SQUEEZE_M
+    commanded_m = _between(_ramp(gripper, *JAW_COMMAND), (squeezed_m, state.max_opening_m / 2))
+    jaw = float(so101.jaw_rad(commanded_m))
+    stone_m = _enclosed(state, state.stone_xyz[current_goal(state).stone]) * state.stone_radius_m
+    expected_m = so101.expected_half_opening_m(jaw, state.finger_opening / 2, stone_m)
+    joints = np.clip(so101.joints_at(gripper_xyz, expected_m), so101.LOW_RAD, so101.HIGH_RAD)
+    joints[-1] = jaw
+    return so101.to_driver(joints).astype(np.float32)
 
 
 def _shares(state: PrivilegedState) -> list[tuple[Goal, float]]:

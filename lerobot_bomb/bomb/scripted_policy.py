@@ -12,7 +12,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
 
-from lerobot_bomb.bomb.observation import ACTION_DIM
+from lerobot_bomb.bomb.observation import ACTION_NAMES
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.compat.use import use
 
@@ -23,8 +23,8 @@ class ScriptedConfig(PreTrainedConfig):
 
     # whether it reads the simulator's true state, which environments then add to observations
     reads_true_state: ClassVar[bool] = True
-    # {env type in which it acts: dimensions of an action there}
-    env_types: ClassVar[dict[str, int]] = {"bomb": ACTION_DIM}
+    # {env type in which it acts: numbers that an action can have there}
+    env_types: ClassVar[dict[str, set[int]]] = {"bomb": {len(names) for names in ACTION_NAMES.values()}}
 
     # publish the policy on the Hub
     push_to_hub: bool = False
@@ -58,10 +58,11 @@ class ScriptedConfig(PreTrainedConfig):
 
     def validate_features(self) -> None:
         shape = None if self.action_feature is None else self.action_feature.shape
-        if shape not in [(dim,) for dim in self.env_types.values()]:
+        dims = set.union(*self.env_types.values())
+        if shape not in {(dim,) for dim in dims}:
             raise ValueError(
                 f"--policy.type={self.type} acts in --env.type={' and '.join(self.env_types)} only, where an "
-                f"action has {' and '.join(map(str, self.env_types.values()))} numbers; here the outputs are "
+                f"action has {' or '.join(map(str, sorted(dims)))} numbers; here the outputs are "
                 f"{self.output_features}"
             )
 

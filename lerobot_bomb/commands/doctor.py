@@ -96,13 +96,15 @@ def check_rendering() -> Iterator[Component]:
     yield Component("opengl", detail if contrast else f"{backend} renders black frames", broken=not contrast)
 
 
-def check_fetch() -> Iterator[Component]:
-    """Check that the arm from gymnasium-robotics can be used; the other one needs nothing."""
-    try:
-        importlib.import_module("lerobot_env_bomb.bomb.fetch_files").fetch_xml()
-        yield Component("--env.robot=fetch", "can run")
-    except ValueError as error:
-        yield Component("--env.robot=fetch", str(error), absent=True)
+def check_arms() -> Iterator[Component]:
+    """Check that the arms of other packages can be used; BOMB's own needs nothing."""
+    arm_files = importlib.import_module("lerobot_env_bomb.bomb.arm_files")
+    for robot in arm_files.PACKAGES:
+        try:
+            arm_files.arm_xml(robot)
+            yield Component(f"--env.robot={robot}", "can run")
+        except ValueError as error:
+            yield Component(f"--env.robot={robot}", str(error), absent=True)
 
 
 def check_sapien() -> Iterator[Component]:
@@ -188,7 +190,7 @@ def check_hub() -> Iterator[Component]:
 CHECKS: tuple[Callable[[], Iterator[Component]], ...] = (
     check_versions,
     check_rendering,
-    check_fetch,
+    check_arms,
     check_sapien,
     check_libero,
     check_types,

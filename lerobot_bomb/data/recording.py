@@ -66,6 +66,11 @@ class Recording(BaseRecording):
             raise ValueError(
                 f"--env.task_ids={list(self.task_ids)} are numbers in a suite; --env.task={ALL} is of all"
             )
+        if self.pointing and self.control_mode == "joints":
+            raise ValueError(
+                "--env.control_mode=joints: --pointing and --static label actions of the gripper; choose "
+                "relative or absolute"
+            )
         object.__setattr__(self, "sapien_version", sapien_version(self.simulator, self.render_preset))
         if not self.protocol_version:
             object.__setattr__(self, "protocol_version", task_version(self.task))

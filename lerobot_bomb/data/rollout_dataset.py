@@ -8,7 +8,7 @@ from lerobot.utils.constants import ACTION, DONE, OBS_IMAGES, OBS_PREFIX, OBS_ST
 
 from lerobot_bomb import __version__
 from lerobot_bomb.bomb.environment import robot_type
-from lerobot_bomb.bomb.observation import ACTION_NAMES, CAMERAS, STATE_NAMES, geometry_shapes
+from lerobot_bomb.bomb.observation import ACTION_NAMES, CAMERAS, geometry_shapes, state_names
 from lerobot_bomb.bomb.pointing import COLUMNS
 from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 from lerobot_bomb.data.recording import Recording
@@ -21,7 +21,7 @@ def rollout_layout(recording: Recording) -> DatasetLayout:
     size = recording.image_size
     dtype = "image" if recording.images else "video"
     image = {"dtype": dtype, "shape": (size, size, 3), "names": ["height", "width", "channels"]}
-    action_names = ACTION_NAMES[recording.control_mode]
+    names = {ACTION: ACTION_NAMES[recording.control_mode], OBS_STATE: state_names(recording.control_mode)}
     # arrays, not images: a policy would take images of depth, intrinsics and extrinsics for cameras
     geometry = {
         f"{OBS_PREFIX}{key}": {"dtype": "float32", "shape": shape, "names": ["row", "column"]}
@@ -33,8 +33,10 @@ def rollout_layout(recording: Recording) -> DatasetLayout:
     }
     features = {
         **{f"{OBS_IMAGES}.{camera}": dict(image) for camera in CAMERAS},
-        OBS_STATE: {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": list(STATE_NAMES)},
-        ACTION: {"dtype": "float32", "shape": (len(action_names),), "names": list(action_names)},
+        **{
+            key: {"dtype": "float32", "shape": (len(names[key]),), "names": list(names[key])}
+            for key in (OBS_STATE, ACTION)
+        },
         **geometry,
         **pointing,
         # True where no action of the same episode follows: a scene belongs to no other

@@ -10,7 +10,7 @@ import numpy as np
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
-from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE, MAX_STEP_M, RenderOptions, action_bounds
+from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE, RenderOptions, action_bounds, max_step
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.envs.vector import FreezeAfterEnd
 from lerobot_bomb.results.record import Spec
@@ -114,13 +114,12 @@ def random_agent(env: gymnasium.Env, seed: int) -> Agent:
 
 
 def add_noise(action: np.ndarray, noise: float, control_mode: str, rng: np.random.Generator) -> np.ndarray:
-    """(4,) action -> (4,) float32 within its bounds, with Gaussian noise on x, y and z.
+    """(D,) action -> (D,) float32 within its bounds, with Gaussian noise on all numbers but the gripper's.
 
     `noise` is its standard deviation in units of the largest relative step. The gripper's command is left
     alone: its sign opens or closes, so noise on it would drop the stone and not merely push the arm off its
     path.
     """
-    scale = noise * (MAX_STEP_M if control_mode == "absolute" else 1.0)
-    offset = np.append(scale * rng.standard_normal(3), 0.0)
+    offset = np.append(noise * max_step(control_mode) * rng.standard_normal(len(action) - 1), 0.0)
     low, high = action_bounds(control_mode)
     return np.clip(action + offset, low, high).astype(np.float32)

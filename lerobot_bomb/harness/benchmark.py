@@ -11,7 +11,7 @@ from vla_eval.specs import IMAGE_RGB, LANGUAGE, DimSpec
 from vla_eval.types import Action, EpisodeResult, Observation, Task
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS, EpisodeSpec
-from lerobot_bomb.bomb.observation import ACTION_DIM, ACTION_NAMES, AGENT_POS, CAMERAS, PIXELS, STATE_DIM
+from lerobot_bomb.bomb.observation import ACTION_NAMES, AGENT_POS, CAMERAS, PIXELS, state_names
 from lerobot_bomb.checkpoints.env_config import decode_env
 from lerobot_bomb.envs.rollout import ENV_ID
 from lerobot_bomb.results.writing import check_results_path
@@ -89,12 +89,13 @@ class BombBenchmark(StepBenchmark):
         return {"max_steps": None}  # the environment ends its episodes
 
     def get_action_spec(self) -> dict[str, DimSpec]:
-        names = ", ".join(ACTION_NAMES[self._config.control_mode])
-        return {"actions": DimSpec("actions", ACTION_DIM, "raw", description=names)}
+        names = ACTION_NAMES[self._config.control_mode]
+        return {"actions": DimSpec("actions", len(names), "raw", description=", ".join(names))}
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
         cameras = dict.fromkeys(CAMERAS, IMAGE_RGB)
-        return {**cameras, "language": LANGUAGE, "state": DimSpec("state", STATE_DIM, "raw")}
+        dims = len(state_names(self._config.control_mode))
+        return {**cameras, "language": LANGUAGE, "state": DimSpec("state", dims, "raw")}
 
     def cleanup(self) -> None:
         if self._env is not None:

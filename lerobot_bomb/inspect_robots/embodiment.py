@@ -138,6 +138,8 @@ def _read_config(flags: dict[str, Any]) -> Any:
             raise ValueError(f"{name} is the task's: --task bomb/SUITE -T perturbations=..., -T task_id=...")
     if flags.get("depth"):
         raise ValueError("depth=true: an observation of Inspect Robots has no depth; use lerobot-eval")
+    if flags.get("control_mode") == "joints":
+        raise ValueError("control_mode=joints: a state of Inspect Robots is the gripper's; use lerobot-eval")
     config: Any = decode_env({"type": "bomb", **flags})
     config.take_image_size(acting_config())
     check_results_path(config.results_path)

@@ -1,9 +1,16 @@
 """BOMB's actions and observations in the words of Inspect Robots."""
 
-from inspect_robots.spaces import ActionSemantics, Box, CameraSpec, ObservationSpace, StateField, StateSpec
+from inspect_robots.spaces import (
+    ActionSemantics,
+    Box,
+    CameraSpec,
+    ControlMode,
+    ObservationSpace,
+    StateField,
+    StateSpec,
+)
 
 from lerobot_bomb.bomb.observation import (
-    ACTION_DIM,
     ACTION_NAMES,
     AGENT_POS,
     CAMERAS,
@@ -14,6 +21,12 @@ from lerobot_bomb.bomb.observation import (
     action_bounds,
 )
 
+# value of --env.control_mode -> its name in Inspect Robots
+CONTROL_MODES: dict[str, ControlMode] = {
+    "relative": "eef_delta_pos",
+    "absolute": "eef_abs_pose",
+    "joints": "joint_pos",
+}
 UNITS = {
     "relative": f"{MAX_STEP_M:g} m times dx, dy, dz is how far the gripper goes from where it is",
     "absolute": "x, y, z is the point in metres to which the gripper goes",
@@ -28,15 +41,15 @@ The gripper's point stays within x {x}, y {y}, z {z} m."""
 
 
 def action_box(control_mode: str) -> Box:
-    """Return the box of actions (4,) of a value of --env.control_mode."""
+    """Return the box of actions of a value of --env.control_mode."""
     low, high = action_bounds(control_mode)
     semantics = ActionSemantics(
-        "eef_abs_pose" if control_mode == "absolute" else "eef_delta_pos",
-        gripper="binary",
-        frame="world",
+        CONTROL_MODES[control_mode],
+        gripper="continuous" if control_mode == "joints" else "binary",
+        frame="base" if control_mode == "joints" else "world",
         dim_labels=ACTION_NAMES[control_mode],
     )
-    return Box((ACTION_DIM,), low, high, semantics)
+    return Box(low.shape, low, high, semantics)
 
 
 def observed_space(image_size: int) -> ObservationSpace:

@@ -7,7 +7,7 @@ import rerun.blueprint as rrb
 from lerobot_bomb.bomb.board import BOARD, COLORS
 from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
 from lerobot_bomb.bomb.move import place_name
-from lerobot_bomb.bomb.observation import ACTION_NAMES, AGENT_POS, CAMERAS, PIXELS, STATE_NAMES
+from lerobot_bomb.bomb.observation import ACTION_NAMES, AGENT_POS, CAMERAS, PIXELS, state_names
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.envs.rollout import Moment
 from lerobot_bomb.results.bomb import PUT_DOWN, EpisodeResult
@@ -65,7 +65,7 @@ class BombLog(EpisodeLog[EpisodeSpec, EpisodeResult]):
 
     @staticmethod
     def _timing_and_curves(spec: EpisodeSpec) -> tuple[int, dict[str, tuple[str, ...]]]:
-        return spec.fps, {"action": ACTION_NAMES[spec.control_mode], "state": STATE_NAMES}
+        return spec.fps, {"action": ACTION_NAMES[spec.control_mode], "state": state_names(spec.control_mode)}
 
     def _log_still(self, moment: Moment) -> None:
         self._log_targets(moment.state)

@@ -9,9 +9,11 @@ import gymnasium
 from lerobot_bomb.bomb.episode import CONTROL_MODES, EpisodeSpec
 from lerobot_bomb.bomb.suites import SUITES
 
-# Gymnasium id -> spec of its episodes: bomb/place-v0 (relative control), bomb/place-absolute-v0
+# Gymnasium id -> spec of its episodes: bomb/place-v0 (relative control), bomb/place-absolute-v0, ...
 GYM_IDS = {
-    f"bomb/{suite}{'' if mode == 'relative' else '-' + mode}-v0": EpisodeSpec(0, suite, control_mode=mode)
+    f"bomb/{suite}{'' if mode == 'relative' else '-' + mode}-v0": EpisodeSpec(
+        0, suite, "so101" if mode == "joints" else "scara", control_mode=mode
+    )
     for suite in SUITES
     for mode in CONTROL_MODES
 }

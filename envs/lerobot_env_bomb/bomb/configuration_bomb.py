@@ -10,20 +10,20 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, EpisodeSpec
 from lerobot_bomb.bomb.observation import (
-    ACTION_DIM,
+    ACTION_NAMES,
     AGENT_POS,
     CAMERAS,
     DEFAULT_IMAGE_SIZE,
-    STATE_DIM,
     RenderOptions,
     geometry_shapes,
+    state_names,
 )
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks, suites_of, task_version
 from lerobot_bomb.checkpoints.env_config import EvaluatedEnv
 from lerobot_bomb.checkpoints.environment import check_acting_policy, side_of_images
 from lerobot_bomb.conditions import ALL
-from lerobot_env_bomb.bomb.fetch_files import check_robot
+from lerobot_env_bomb.bomb.arm_files import check_robot
 from lerobot_env_bomb.bomb.simulators import check_simulator
 
 
@@ -39,11 +39,11 @@ class BombEnvConfig(EvaluatedEnv, EnvConfig):
     task_ids: list[int] | None = None
     # control steps per second; a divisor of 200
     fps: int = DEFAULT_FPS
-    # arm: scara, or fetch (of gymnasium-robotics; needs MuJoCo 3)
+    # arm: scara, fetch (of gymnasium-robotics; needs MuJoCo 3) or so101 (extra so101)
     robot: str = "scara"
     # physics: mujoco, or sapien (PhysX; extra sapien)
     simulator: str = "mujoco"
-    # relative: dx, dy, dz in units of 40 mm; absolute: x, y, z in metres
+    # relative: dx, dy, dz in units of 40 mm; absolute: x, y, z in metres; joints: those of so101 in degrees
     control_mode: str = "relative"
     # intersections, templates and table colours to draw from: all, train or heldout
     split: str = "all"
@@ -80,8 +80,8 @@ class BombEnvConfig(EvaluatedEnv, EnvConfig):
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(side, side, 3))
         cameras = [f"{OBS_IMAGES}.{camera}" for camera in CAMERAS]
         self.features = {
-            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,)),
-            AGENT_POS: PolicyFeature(type=FeatureType.STATE, shape=(STATE_DIM,)),
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES[self.control_mode]),)),
+            AGENT_POS: PolicyFeature(type=FeatureType.STATE, shape=(len(state_names(self.control_mode)),)),
             **dict.fromkeys(cameras, image),
         }
         self.features_map = {ACTION: ACTION, AGENT_POS: OBS_STATE, **{key: key for key in cameras}}

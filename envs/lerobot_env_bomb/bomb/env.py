@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_bomb.bomb import so101
 from lerobot_bomb.bomb.board import Intersection
 from lerobot_bomb.bomb.camera import PinholeCamera
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, PHYSICS_HZ, EpisodeSpec
@@ -25,8 +26,8 @@ from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.origin import PolicyIdentity, sapien_version
 from lerobot_env_bomb.bomb.actuator import Actuator
 from lerobot_env_bomb.bomb.alternatives import alternatives
+from lerobot_env_bomb.bomb.arm_files import check_robot
 from lerobot_env_bomb.bomb.axes.dynamics import Dynamics
-from lerobot_env_bomb.bomb.fetch_files import check_robot
 from lerobot_env_bomb.bomb.object_masks import object_masks
 from lerobot_env_bomb.bomb.perturb import PerturbedEpisode, sample_episode
 from lerobot_env_bomb.bomb.render import Renderer, compose_caption, extrinsics, intrinsics, renderer_of
@@ -59,11 +60,12 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
 
     Action: float32 (4,). Relative: x, y, z in units of MAX_STEP_M per control step from where the
     gripper is; absolute: x, y, z in metres. The fourth opens the fingers at >= 0 and closes them below.
+    Joints, float32 (6,): of SO-101, in degrees, the jaw's in percent, as the real arm's driver has them.
     An action outside the action space is clipped.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": DEFAULT_FPS}  # noqa: RUF012
-    gripper_dims = (3,)
+    gripper_dims = (-1,)
 
     def __init__(
         self,
@@ -86,7 +88,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         self._task_ids, self._policy = task_ids, policy
         self.action_space = action_space(spec.control_mode)
         self._action_low, self._action_high = self.action_space.low, self.action_space.high
-        self.observation_space = observation_space(render_options, suite.num_goals)
+        self.observation_space = observation_space(render_options, suite.num_goals, spec.control_mode)
         self._now: SceneState  # measured after the last control step
         self._renderer: Renderer | None = None
 
@@ -117,13 +119,16 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
             scene=scene,
             episode=episode,
             judge=Judge(episode, self._spec.fps, now, start.made),
-            actuator=Actuator(self._spec.control_mode, now.gripper_xyz, dynamics, episode.spec.seed),
+            actuator=Actuator(self._spec.control_mode, start.layout, dynamics, episode.spec.seed),
         )
         self.task_description = episode.instruction_after(len(start.made))
 
     def _advance(self, run: _Run, action: np.ndarray) -> Transition:
-        target_xyz, open_fingers = run.actuator.command(action, self._now.gripper_xyz)
-        run.scene.move(target_xyz, open_fingers, self._num_substeps)
+        command = run.actuator.command(action, self._now.gripper_xyz)
+        if self._spec.control_mode == "joints":
+            run.scene.move_joints(so101.from_driver(command), self._num_substeps)
+        else:
+            run.scene.move(command[:3], bool(command[3] >= 0), self._num_substeps)
         self._now = run.scene.measure()
         terminated = run.judge.update(self._now)
         self.task_description = run.episode.instruction_after(run.judge.num_made)
@@ -196,7 +201,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
             fps=self._spec.fps,
             stone_radius_m=run.episode.layout.stone_radius_m,
             max_opening_m=2 * run.scene.robot.max_half_opening_m,
-            pending_motion_m=run.actuator.pending_motion_m(now.gripper_xyz),
+            pending_motion_m=run.actuator.pending_motion_m(now.gripper_xyz, now.finger_opening),
             pending_gripper=run.actuator.pending_gripper,
         )
 
@@ -224,7 +229,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return alternatives(self._run.episode)
 
     def _check(self, action: np.ndarray) -> np.ndarray:
-        """Return an action as (4,) float64 within the action space."""
+        """Return an action as float64 within the action space."""
         return np.clip(super()._check(action).astype(np.float64), self._action_low, self._action_high)
 
     def _observe(self) -> Observation:
@@ -232,10 +237,15 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         views = {camera: self._view(camera) for camera in CAMERAS}
         return {
             PIXELS: {camera: image for camera, (image, _) in views.items()},
-            AGENT_POS: np.array([*state.gripper_xyz, state.finger_opening], dtype=np.float32),
+            AGENT_POS: self._agent_pos(state).astype(np.float32),
             ENVIRONMENT_STATE: state.to_vector(),
             **{key: value for _, geometry in views.values() for key, value in geometry.items()},
         }
+
+    def _agent_pos(self, state: PrivilegedState) -> np.ndarray:
+        if self._spec.control_mode == "joints":
+            return so101.to_driver(self._run.scene.joints())
+        return np.array([*state.gripper_xyz, state.finger_opening])
 
     def _view(self, camera: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """(H, W, 3) uint8 image; depth, intrinsics and extrinsics by key, if requested."""

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_env_bomb.bomb.fetch_files import fetch_xml
+from lerobot_env_bomb.bomb.arm_files import arm_xml
+from lerobot_env_bomb.bomb.hand import PAD_SIDES, weld_to_command
 from lerobot_env_bomb.shared.mujoco_gl import mujoco
 
 SCENE_XML = Path(__file__).with_name("scene.xml")
@@ -43,7 +44,7 @@ FINGER_INERTIA = (5e-6, 1e-5, 1e-5)  # kg m^2
 
 def load_fetch() -> mujoco.MjSpec:
     """Load BOMB's scene with the Fetch arm."""
-    fetch = mujoco.MjSpec.from_file(str(fetch_xml()))
+    fetch = mujoco.MjSpec.from_file(str(arm_xml("fetch")))
     for name in LEFT_OUT_BODIES:
         fetch.delete(fetch.body(PREFIX + name))
     for name in LEFT_OUT_JOINTS:
@@ -58,12 +59,12 @@ def load_fetch() -> mujoco.MjSpec:
     for joint in torso.find_all("joint"):
         joint.damping[0], joint.armature = JOINT_DAMPING, JOINT_ARMATURE  # damping: a polynomial's terms
     _add_hand(spec, spec.body(f"{PREFIX}gripper_link"))
-    for side, letter, outwards in (("left", "l", -1), ("right", "r", 1)):
-        _replace_servo(spec, side, spec.body(f"{PREFIX}{letter}_gripper_finger_link"), outwards)
+    for side, outwards in zip(PAD_SIDES, (-1, 1), strict=True):
+        _replace_servo(spec, side, spec.body(f"{PREFIX}{side[0]}_gripper_finger_link"), outwards)
     return spec
 
 
-def fetch_joints(gripper_xyz: np.ndarray) -> dict[str, float]:
+def fetch_joints(gripper_xyz: np.ndarray, _half_opening_m: float) -> dict[str, float]:
     """Joint positions (radians) that put the gripper at (3,) metres, pointing down, elbow up."""
     offset = gripper_xyz[:2] - PAN_XY
     pan = float(np.arctan2(offset[0], -offset[1]))
@@ -90,17 +91,7 @@ def _add_hand(spec: mujoco.MjSpec, gripper: mujoco.MjsBody) -> None:
     """Add grip point, wrist camera and the weld that drives them."""
     # The gripper's x points down, its y along the world's x, its z towards the viewer: -y.
     world_in_gripper = [0.5, -0.5, -0.5, 0.5]
-    gripper.add_site(name="grip", pos=[FINGERTIP_X_M, 0, 0], quat=world_in_gripper, rgba=[0, 0, 0, 0])
-    spec.body("command").add_site(name="command", rgba=[0, 0, 0, 0])
-    spec.add_equality(
-        name="command",
-        type=mujoco.mjtEq.mjEQ_WELD,
-        objtype=mujoco.mjtObj.mjOBJ_SITE,
-        name1="grip",
-        name2="command",
-        solref=[0.01, 0.8],
-        solimp=[0.9, 0.9, 0.001, 0.5, 2],
-    )
+    weld_to_command(spec, gripper, pos=[FINGERTIP_X_M, 0, 0], quat=world_in_gripper)
     hand = gripper.add_frame(pos=[FINGERTIP_X_M, 0, 0], quat=world_in_gripper)
     tilt = [np.cos(CAMERA_TILT_RAD / 2), np.sin(CAMERA_TILT_RAD / 2), 0, 0]
     gripper.add_camera(name="wrist", pos=CAMERA_XYZ, quat=tilt, fovy=52).set_frame(hand)

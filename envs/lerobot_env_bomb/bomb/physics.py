@@ -11,8 +11,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from lerobot_bomb.bomb.board import NUM_STONES
+from lerobot_env_bomb.bomb.hand import PAD_SIDES
 from lerobot_env_bomb.bomb.model import stone_name
-from lerobot_env_bomb.bomb.robots import PAD_SIDES, Robot
+from lerobot_env_bomb.bomb.robots import Robot
 from lerobot_env_bomb.shared.mujoco_gl import mujoco
 
 

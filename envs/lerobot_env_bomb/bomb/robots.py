@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from lerobot_bomb.bomb import so101
 from lerobot_env_bomb.bomb.fetch import MAX_HALF_OPENING_M, fetch_joints, load_fetch
+from lerobot_env_bomb.bomb.so101 import load_so101, so101_joints
 from lerobot_env_bomb.shared.mujoco_gl import mujoco
 
 SCARA_XML = Path(__file__).with_name("scara.xml")
 BASE_XY = np.array([0.0, 0.30])  # metres, SCARA's shoulder; as in scara.xml
 LINK_M = 0.27  # length of either of SCARA's links; as in scara.xml
-PAD_SIDES = ("left", "right")
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class Robot:
     """
 
     load: Callable[[], mujoco.MjSpec]  # the scene with this arm
-    joints: Callable[[np.ndarray], dict[str, float]]  # gripper (3,) metres -> its arm's joint positions
+    # gripper (3,) metres and half its opening -> its arm's joint positions
+    joints: Callable[[np.ndarray, float], dict[str, float]]
     max_half_opening_m: float  # of one finger, so that open fingers clear a neighbouring stone
 
 
@@ -35,7 +37,7 @@ def load_scara() -> mujoco.MjSpec:
     return mujoco.MjSpec.from_file(str(SCARA_XML))
 
 
-def scara_joints(gripper_xyz: np.ndarray) -> dict[str, float]:
+def scara_joints(gripper_xyz: np.ndarray, _half_opening_m: float) -> dict[str, float]:
     """Joint positions (radians, metres) that put SCARA's gripper at (3,) metres, elbow to the left."""
     reach = gripper_xyz[:2] - BASE_XY
     cosine = (reach @ reach) / (2 * LINK_M**2) - 1
@@ -48,4 +50,5 @@ ROBOTS = {
     # outer faces of the fingers then clear a neighbour at one pitch by 5 mm
     "scara": Robot(load_scara, scara_joints, max_half_opening_m=0.022),
     "fetch": Robot(load_fetch, fetch_joints, MAX_HALF_OPENING_M),
+    "so101": Robot(load_so101, so101_joints, so101.MAX_HALF_OPENING_M),
 }

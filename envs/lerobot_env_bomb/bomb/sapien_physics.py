@@ -18,9 +18,10 @@ from sapien import Pose, physx
 
 from lerobot_bomb.bomb.board import NUM_STONES
 from lerobot_bomb.bomb.episode import PHYSICS_HZ
+from lerobot_env_bomb.bomb.hand import PAD_SIDES
 from lerobot_env_bomb.bomb.model import stone_name
 from lerobot_env_bomb.bomb.physics import touched_stones
-from lerobot_env_bomb.bomb.robots import PAD_SIDES, Robot
+from lerobot_env_bomb.bomb.robots import Robot
 from lerobot_env_bomb.shared.mujoco_gl import mujoco
 from lerobot_env_bomb.shared.rotations import quaternion_of
 
@@ -141,7 +142,7 @@ class SapienPhysics:
 
     def finish(self) -> None:
         *xyz, left, right = self._hand.qpos.astype(np.float64)
-        joints = self._robot.joints(np.array(xyz)) | {"left_finger": left, "right_finger": right}
+        joints = self._robot.joints(np.array(xyz), 0) | {"left_finger": left, "right_finger": right}
         for name, position in joints.items():
             self._data.joint(name).qpos = position
         for index, stone in self._stones.items():

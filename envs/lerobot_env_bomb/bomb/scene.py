@@ -5,9 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from lerobot_bomb.bomb import so101
 from lerobot_bomb.bomb.board import NUM_STONES, Intersection
 from lerobot_bomb.bomb.layout import Layout, SceneState
 from lerobot_bomb.bomb.observation import WORKSPACE_HIGH_M, WORKSPACE_LOW_M
+from lerobot_env_bomb.bomb.hand import PAD_SIDES
 from lerobot_env_bomb.bomb.model import (
     NUM_FEET,
     STONE_RGBA,
@@ -18,9 +20,10 @@ from lerobot_env_bomb.bomb.model import (
     stone_name,
 )
 from lerobot_env_bomb.bomb.physics import MujocoPhysics, Physics
-from lerobot_env_bomb.bomb.robots import PAD_SIDES, ROBOTS, Robot
+from lerobot_env_bomb.bomb.robots import ROBOTS, Robot
 from lerobot_env_bomb.bomb.simulators import import_with_sapien
 from lerobot_env_bomb.shared.mujoco_gl import mujoco
+from lerobot_env_bomb.shared.rotations import quaternion_of
 
 WORKSPACE_LOW = np.array(WORKSPACE_LOW_M)
 WORKSPACE_HIGH = np.array(WORKSPACE_HIGH_M)
@@ -46,6 +49,12 @@ def physics_of(simulator: str) -> "Callable[[Robot, mujoco.MjModel, mujoco.MjDat
         ValueError: SAPIEN cannot be imported.
     """
     return MujocoPhysics if simulator == "mujoco" else import_with_sapien("sapien_physics").SapienPhysics
+
+
+def _smooth(share: float) -> float:
+    """Return the smoothstep of a share of the way: no jerk that would shake a held stone."""
+    share = min(1.0, share)
+    return 3 * share**2 - 2 * share**3
 
 
 class Scene:
@@ -91,11 +100,9 @@ class Scene:
         for i, adr in enumerate(self._stone_qpos):
             xyz = [*layout.stone_xy[i], layout.rest_height_m] if layout.stone_in_play[i] else parked_xyz(i)
             self.data.qpos[adr : adr + 7] = [*xyz, 1, 0, 0, 0]
-        for joint, value in self.robot.joints(layout.gripper_xyz).items():
-            self.data.joint(joint).qpos = value
-        self.data.qpos[self._fingers] = self.robot.max_half_opening_m
-        self.data.ctrl[:] = self.robot.max_half_opening_m
         self.data.mocap_pos[0] = layout.gripper_xyz
+        self._set_arm(self.robot.max_half_opening_m)
+        self.data.ctrl[:] = self.robot.max_half_opening_m
         mujoco.mj_forward(self.model, self.data)
         self._physics.begin()
 
@@ -103,7 +110,7 @@ class Scene:
         """Put a stone with its centre at (3,) metres between pads that are ``opening_m`` apart."""
         adr = self._stone_qpos[stone]
         self.data.qpos[adr : adr + 3] = stone_xyz
-        self.data.qpos[self._fingers] = opening_m / 2
+        self._set_arm(opening_m / 2)
         mujoco.mj_forward(self.model, self.data)
 
     def move(self, target_xyz: np.ndarray, open_fingers: bool, num_substeps: int) -> None:
@@ -113,10 +120,23 @@ class Scene:
         opening_m = self.robot.max_half_opening_m if open_fingers else 0.0
         num_travel = max(1, round(TRAVEL_SHARE * num_substeps))
         for substep in range(num_substeps):
-            share = min(1.0, (substep + 1) / num_travel)
-            # smoothstep: no jerk that would shake a held stone
-            self._physics.step(start + (3 * share**2 - 2 * share**3) * (target - start), opening_m)
+            self._physics.step(start + _smooth((substep + 1) / num_travel) * (target - start), opening_m)
         self._physics.finish()
+
+    def move_joints(self, target: np.ndarray, num_substeps: int) -> None:
+        """Move SO-101's joints to (6,) radians; stones and board may hold them off."""
+        start, self._joints = self._joints, target
+        num_travel = max(1, round(TRAVEL_SHARE * num_substeps))
+        for substep in range(num_substeps):
+            joints = start + _smooth((substep + 1) / num_travel) * (target - start)
+            xyz, rotation = so101.grip_pose(joints, float(self.data.qpos[self._fingers[0]]))
+            self.data.mocap_quat[0] = quaternion_of(rotation)
+            self._physics.step(xyz, so101.jaw_half_opening_m(joints[-1]))
+        self._physics.finish()
+
+    def joints(self) -> np.ndarray:
+        """Return the measured positions of the robot's joints."""
+        return np.array([self.data.joint(name).qpos[0] for name in self._joint_names])
 
     def measure(self) -> SceneState:
         """Return the current poses and contacts."""
@@ -126,6 +146,14 @@ class Scene:
             stone_xyz=self.data.xpos[self._stone_bodies].copy(),
             stone_touched=self._physics.touched(),
         )
+
+    def _set_arm(self, half_opening_m: float) -> None:
+        """Put arm and fingers where the command is."""
+        joints = self.robot.joints(self.data.mocap_pos[0], half_opening_m)
+        for joint, value in joints.items():
+            self.data.joint(joint).qpos = value
+        self._joint_names, self._joints = tuple(joints), np.array(list(joints.values()))
+        self.data.qpos[self._fingers] = half_opening_m
 
     def _show_stones(self, layout: Layout) -> None:
         """Colour the stones in play; hide the others and take contact and weight from them."""

@@ -10,10 +10,10 @@ from lerobot_bomb.bomb.observation import (
     CAMERAS,
     ENVIRONMENT_STATE,
     PIXELS,
-    STATE_DIM,
     RenderOptions,
     action_bounds,
     geometry_shapes,
+    state_names,
 )
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 
@@ -21,22 +21,24 @@ from lerobot_bomb.bomb.privileged_state import PrivilegedState
 POSITION_LIMIT_M = 100.0
 # Pads that scrape over the board at metres per second drag fingers past their soft stops: docs/bomb.md.
 GRIPPER_LIMIT_M = 1.0
+JOINT_LIMIT = 360.0  # degrees, percent
 
 
 def action_space(control_mode: str) -> spaces.Box:
-    """float32 (4,): relative in units of MAX_STEP_M, or absolute in metres; gripper in [-1, 1]."""
+    """float32: (4,), relative in units of MAX_STEP_M or absolute in metres; (6,) joints, in degrees."""
     low, high = action_bounds(control_mode)
     return spaces.Box(low, high, dtype=np.float32)
 
 
-def observation_space(options: RenderOptions, num_goals: int) -> spaces.Dict:
-    """Images of both cameras, (4,) state of the gripper, the privileged state for oracles, geometry."""
+def observation_space(options: RenderOptions, num_goals: int, control_mode: str) -> spaces.Dict:
+    """Images of both cameras, state of gripper or joints, the privileged state for oracles, geometry."""
     shape = (options.image_size, options.image_size, 3)
+    state_limit = JOINT_LIMIT if control_mode == "joints" else GRIPPER_LIMIT_M
     limit = max(POSITION_LIMIT_M, NUM_STONES, len(Stage), PHYSICS_HZ)
     return spaces.Dict(
         {
             PIXELS: spaces.Dict({camera: spaces.Box(0, 255, shape, np.uint8) for camera in CAMERAS}),
-            AGENT_POS: spaces.Box(-GRIPPER_LIMIT_M, GRIPPER_LIMIT_M, (STATE_DIM,), np.float32),
+            AGENT_POS: spaces.Box(-state_limit, state_limit, (len(state_names(control_mode)),), np.float32),
             ENVIRONMENT_STATE: spaces.Box(-limit, limit, (PrivilegedState.dim(num_goals),), np.float32),
             **{
                 key: spaces.Box(-np.inf, np.inf, shape, np.float32)

@@ -14,4 +14,4 @@ from lerobot_bomb.libero.episode import ACTION_DIM
 class BombExpertConfig(ScriptedConfig):
     """The expert has no settings of its own."""
 
-    env_types: ClassVar = ScriptedConfig.env_types | {"bomb_libero": ACTION_DIM}
+    env_types: ClassVar = ScriptedConfig.env_types | {"bomb_libero": {ACTION_DIM}}

