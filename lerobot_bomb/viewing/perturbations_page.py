@@ -27,7 +27,7 @@ lerobot-bomb view --env.perturbations=camera:3 --seed=7
 lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/gallery
 ```
 
-- An **axis** changes one thing and leaves all others alone.
+- An **axis** changes one thing only.
 - A **level** is the strength of the change, from 0 (none) to {MAX_LEVEL}; `language` has five forms instead.
   The seed draws colours and directions, so its levels differ only in strength.
 - A **condition** is `none`, or axes with levels, such as `camera:2+light:3`. `lerobot-eval` needs brackets
