@@ -33,7 +33,7 @@ FOOT_QUAT = (np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5))
 BLOCK_SIZE_M = (0.06, 0.09)  # half the width and depth of the block that it stands on
 BLOCK_Y_M = 0.285
 JOINT_DAMPING, JOINT_ARMATURE = 0.2, 0.001  # N m s/rad, kg m^2
-PALM_KG, PALM_INERTIA = 0.005, (1e-6, 1e-6, 1e-6)  # kg m^2
+PALM_KG, PALM_INERTIA = 0.005, (1e-6, 1e-6, 1e-6)  # kg m^2; as light as a finger
 CAMERA_XYZ = np.array([BOARD.stone_radius_m, -0.075, 0.105])  # metres from the fixed jaw's tip
 CAMERA_TILT_RAD = np.deg2rad(30)  # from straight down towards the jaws
 
@@ -53,6 +53,7 @@ def load_so101() -> mujoco.MjSpec:
     spec = mujoco.MjSpec.from_file(str(SCENE_XML))
     base = spec.worldbody.add_frame().attach_body(arm.body("base"), "", "")
     for body in [base, *base.find_all("body")]:
+        # the file has seven digits, and errors of its export below them, which the kinematics leave out
         body.pos, body.ipos, body.gravcomp = SCALE * np.round(body.pos, 7), SCALE * body.ipos, 1
         body.fullinertia = SCALE**2 * body.fullinertia
     for geom in base.find_all("geom"):
