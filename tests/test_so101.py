@@ -1,3 +1,4 @@
+# pyright: reportAttributeAccessIssue=false
 """SO-101: its kinematics, and control by its joints as the real arm's driver has them."""
 
 from collections.abc import Callable
@@ -5,6 +6,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -160,7 +162,7 @@ def test_recordings_have_the_real_arms_features(tmp_path: Path, stock_cli: Calla
     root, results = tmp_path / "data", tmp_path / "results.jsonl"
     flags = "--env.robot=so101 --env.control_mode=joints --env.image_size=32 --images --episodes=2 --seed=5"
     assert main(["record", "--repo_id=me/so101", f"--root={root}", *flags.split()]) in (0, None)
-    dataset = LeRobotDataset("me/so101", root=root)
+    dataset: Any = LeRobotDataset("me/so101", root=root)
     names = list(ACTION_NAMES["joints"])
     for key in ("action", "observation.state"):
         assert dataset.meta.features[key]["names"] == names
