@@ -5,7 +5,6 @@ from collections import deque
 import numpy as np
 
 from lerobot_bomb.bomb import so101
-from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.observation import MAX_STEP_DEG, MAX_STEP_M
 from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_env_bomb.bomb.axes.dynamics import Dynamics
@@ -14,9 +13,15 @@ from lerobot_env_bomb.bomb.axes.dynamics import Dynamics
 class Actuator:
     """Actuator of one episode; `dynamics` makes it late and imprecise."""
 
-    def __init__(self, control_mode: str, layout: Layout, dynamics: Dynamics | None, seed: int):
-        self._control_mode, gripper_xyz = control_mode, layout.gripper_xyz
-        self._stone_radius_m = layout.stone_radius_m
+    def __init__(
+        self,
+        control_mode: str,
+        gripper_xyz: np.ndarray,
+        stone_radius_m: float,
+        dynamics: Dynamics | None,
+        seed: int,
+    ):
+        self._control_mode, self._stone_radius_m = control_mode, stone_radius_m
         step = MAX_STEP_DEG if control_mode == "joints" else MAX_STEP_M
         self._noise = 0.0 if dynamics is None else step * dynamics.noise
         self._rng = generator(seed, Stream.ACTUATOR_NOISE)

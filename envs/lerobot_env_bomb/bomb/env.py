@@ -119,7 +119,13 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
             scene=scene,
             episode=episode,
             judge=Judge(episode, self._spec.fps, now, start.made),
-            actuator=Actuator(self._spec.control_mode, start.layout, dynamics, episode.spec.seed),
+            actuator=Actuator(
+                self._spec.control_mode,
+                now.gripper_xyz,
+                start.layout.stone_radius_m,
+                dynamics,
+                episode.spec.seed,
+            ),
         )
         self.task_description = episode.instruction_after(len(start.made))
 
