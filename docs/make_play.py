@@ -26,8 +26,8 @@ from lerobot_bomb.bomb.episode import TEST_SEEDS, EpisodeSpec, Failure, Stage
 from lerobot_bomb.bomb.perturbations import AXES
 from lerobot_bomb.bomb.suites import OWN_SUITES, place
 from lerobot_bomb.conditions import MAX_LEVEL
+from lerobot_env_bomb.bomb import hand, robots, scene
 from lerobot_env_bomb.bomb import model as model_module
-from lerobot_env_bomb.bomb import robots, scene
 from lerobot_env_bomb.bomb.scene import EDITABLE, Scene
 from lerobot_env_bomb.shared.mujoco_gl import mujoco
 
@@ -50,7 +50,7 @@ NUM_SEEDS = 20  # from the first of the protocol's seeds on
 # whose numbers, names and tables the page uses
 CONSTANTS: tuple[ModuleType, ...] = (
     *(board, commands, episode, expert, judge, move, observation),
-    *(scene, model_module, place, robots),
+    *(scene, model_module, place, robots, hand),
 )
 
 
@@ -82,7 +82,7 @@ def constants() -> dict[str, dict[str, Any]]:
     arm = robots.ROBOTS[ROBOT]
     modules["robots"] |= {
         "MAX_HALF_OPENING_M": arm.max_half_opening_m,
-        "JOINTS": list(arm.joints(np.array([*board.TRAY_CENTER_XY, 0.1]))),
+        "JOINTS": list(arm.joints(np.array([*board.TRAY_CENTER_XY, 0.1]), 0.0)),
     }
     modules["episode"] |= {
         "STAGES": list(Stage),

@@ -112,7 +112,7 @@ def start_of(drawn: Episode) -> dict[str, Any]:
     return {
         "instructions": [turn.instruction for turn in drawn.turns],
         "gripper": rounded(layout.gripper_xyz),
-        "arm": rounded(robots.ROBOTS[ROBOT].joints(layout.gripper_xyz).values()),
+        "arm": rounded(robots.ROBOTS[ROBOT].joints(layout.gripper_xyz, 0.0).values()),
         "stones": [[*rounded(layout.stone_xy[i]), int(layout.stone_is_white[i])] for i in stones],
         "stone_size": rounded([layout.stone_radius_m, layout.stone_height_m]),
     }

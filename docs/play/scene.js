@@ -1,6 +1,6 @@
 // Runs BOMB's model in MuJoCo's WASM: a port of bomb/scene.py, physics.py and actuator.py of lerobot_env_bomb.
 import { clip } from "./board.js";
-import { board, episode as rules, model as built, observation, robots, scene } from "./constants.js";
+import { board, episode as rules, hand, model as built, observation, robots, scene } from "./constants.js";
 
 const NUM_SUBSTEPS = rules.PHYSICS_HZ / rules.DEFAULT_FPS;
 const NUM_TRAVEL = Math.max(1, Math.round(scene.TRAVEL_SHARE * NUM_SUBSTEPS));
@@ -42,9 +42,9 @@ export class Scene {
     ]);
     const address = (name) => model.jnt_qposadr[model.jnt(name).id];
     this._stoneQpos = names.map(address);
-    this._fingers = robots.PAD_SIDES.map((side) => address(`${side}_finger`));
+    this._fingers = hand.PAD_SIDES.map((side) => address(`${side}_finger`));
     this._arm = robots.JOINTS.map(address);
-    this._pads = robots.PAD_SIDES.map((side) => model.geom(`${side}_pad`).id);
+    this._pads = hand.PAD_SIDES.map((side) => model.geom(`${side}_pad`).id);
     this._grip = model.site("grip").id;
     this._nominal = [...scene.EDITABLE, ...CONTACT, ...HEADLIGHT].map((name) => [
       name,
