@@ -79,7 +79,8 @@ def expert_action(state: PrivilegedState) -> np.ndarray:
     """
     tempo = DEFAULT_FPS / state.fps
     motions_m, grippers = [], []
-    for goal, share in _shares(state):
+    shares = _shares(state)
+    for goal, share in shares:
         motion_m, gripper = _plan(_anticipate(replace(state, goals=(goal,))), tempo)
         motions_m.append(share * motion_m)
         grippers.append(share * gripper)
@@ -90,12 +91,12 @@ def expert_action(state: PrivilegedState) -> np.ndarray:
     xyz = np.clip(gripper_xyz + motion_m, WORKSPACE_LOW_M, WORKSPACE_HIGH_M)
     if state.control_mode == "absolute":
         return np.array([*xyz, gripper], dtype=np.float32)
-    return _joints(state, xyz, gripper)
+    return _joints(state, _largest(shares).stone, xyz, gripper)
 
 
 def current_goal(state: PrivilegedState) -> Goal:
     """Return the goal with the largest share of an action."""
-    return max(_shares(state), key=lambda each: each[1])[0]
+    return _largest(_shares(state))
 
 
 def held_share(state: PrivilegedState, stone: int) -> float:
@@ -103,16 +104,20 @@ def held_share(state: PrivilegedState, stone: int) -> float:
     return _held(state, state.stone_xyz[stone])
 
 
-def _joints(state: PrivilegedState, gripper_xyz: np.ndarray, gripper: float) -> np.ndarray:
+def _joints(state: PrivilegedState, stone: int, gripper_xyz: np.ndarray, gripper: float) -> np.ndarray:
     """(6,) float32: joints that bring the gripper there, with the jaw at a gripper command in [-1, 1]."""
     squeezed_m = state.stone_radius_m - JAW_SQUEEZE_M
     commanded_m = _between(_ramp(gripper, *JAW_COMMAND), (squeezed_m, state.max_opening_m / 2))
     jaw = float(so101.jaw_rad(commanded_m))
-    stone_m = _enclosed(state, state.stone_xyz[current_goal(state).stone]) * state.stone_radius_m
+    stone_m = _enclosed(state, state.stone_xyz[stone]) * state.stone_radius_m
     expected_m = so101.expected_half_opening_m(jaw, state.finger_opening / 2, stone_m)
     joints = np.clip(so101.joints_at(gripper_xyz, expected_m), so101.LOW_RAD, so101.HIGH_RAD)
     joints[-1] = jaw
     return so101.to_driver(joints).astype(np.float32)
+
+
+def _largest(shares: list[tuple[Goal, float]]) -> Goal:
+    return max(shares, key=lambda each: each[1])[0]
 
 
 def _shares(state: PrivilegedState) -> list[tuple[Goal, float]]:

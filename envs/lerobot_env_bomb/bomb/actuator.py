@@ -26,11 +26,10 @@ class Actuator:
         self._noise = 0.0 if dynamics is None else step * dynamics.noise
         self._rng = generator(seed, Stream.ACTUATOR_NOISE)
         # until the first action arrives: stay, with open fingers
-        rest = {
-            "relative": np.array([0.0, 0.0, 0.0, 1.0]),
-            "absolute": np.array([*gripper_xyz, 1.0]),
-            "joints": so101.to_driver(so101.joints_at(gripper_xyz, so101.MAX_HALF_OPENING_M)),
-        }[control_mode]
+        if control_mode == "joints":
+            rest = so101.to_driver(so101.joints_at(gripper_xyz, so101.MAX_HALF_OPENING_M))
+        else:
+            rest = np.array([*(gripper_xyz if control_mode == "absolute" else np.zeros(3)), 1.0])
         self._pending = deque([rest] * (0 if dynamics is None else dynamics.latency))
 
     def command(self, action: np.ndarray, gripper_xyz: np.ndarray) -> np.ndarray:

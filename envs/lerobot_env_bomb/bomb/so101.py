@@ -45,11 +45,12 @@ STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("att
 
 def load_so101() -> mujoco.MjSpec:
     """Load BOMB's scene with the SO-101."""
-    arm = mujoco.MjSpec.from_file(str(arm_xml("so101")))
+    file = arm_xml("so101")
+    arm = mujoco.MjSpec.from_file(str(file))
     for actuator in list(arm.actuators):
         arm.delete(actuator)
     for mesh in arm.meshes:
-        _simplify(mesh, arm_xml("so101").parent / arm.meshdir)
+        _simplify(mesh, file.parent / arm.meshdir)
     spec = mujoco.MjSpec.from_file(str(SCENE_XML))
     base = spec.worldbody.add_frame().attach_body(arm.body("base"), "", "")
     for body in [base, *base.find_all("body")]:
