@@ -11,6 +11,7 @@ from recipes import recipe_path
 
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
+from lerobot_bomb.training.policy_flags import OPTIMIZERS
 
 Run = Callable[..., None]
 REPO_ID = "overfit/bomb_place"
@@ -52,12 +53,14 @@ def weights(output_dir: Path, step: int) -> tuple[bytes, bytes]:
 
 
 @pytest.mark.one_type
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
 def test_a_resumed_training_is_the_uninterrupted_one(
-    policy_type: str, stock_cli: Run, dataset: Path, losses: list[float], tmp_path: Path
+    optimizer: str, policy_type: str, stock_cli: Run, dataset: Path, losses: list[float], tmp_path: Path
 ) -> None:
     meta = LeRobotDatasetMetadata(REPO_ID, root=dataset)
     flags = f"--batch_size=2 --num_workers=0 --steps=4 --save_freq=2 --dataset.root={dataset}"
     flags += f" --policy.drop_n_last_frames={meta.total_frames - NUM_FRAMES} --policy.crop_fraction=0.8"
+    flags += f" --policy.optimizer={optimizer}"
     whole, second = tmp_path / "whole", tmp_path / "second"
     stock_cli(
         "lerobot-train",

@@ -15,8 +15,9 @@ from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.policies.pointing import LABELS
 from lerobot_bomb.training.policy_flags import (
+    ADAMW,
+    OPTIMIZERS,
     action_deltas,
-    adamw,
     check_cameras_and_action,
     check_chunk,
     check_crop,
@@ -26,6 +27,7 @@ from lerobot_bomb.training.policy_flags import (
     check_state,
     check_training,
     cosine_decay,
+    optimizer,
 )
 
 DTYPES = ("float32", "bfloat16")
@@ -43,7 +45,7 @@ class ChunkConfig(ConfigWithEnvironment):
     """Config of chunk, normalisation and training; a policy overrides defaults by those of its paper."""
 
     # allowed values of flags
-    CHOICES: ClassVar[dict[str, tuple]] = {}
+    CHOICES: ClassVar[dict[str, tuple]] = {"optimizer": OPTIMIZERS}
     # how state and action may be normalised
     MODES: ClassVar[tuple[NormalizationMode, ...]] = tuple(NormalizationMode)
     # whether a checkpoint's weights fix the number of action dims; text does not
@@ -80,7 +82,9 @@ class ChunkConfig(ConfigWithEnvironment):
     # version of lerobot_bomb that wrote the checkpoint
     package_version: PackageVersion = INSTALLED
 
-    # AdamW's learning rate after warm-up
+    # "adamw", or "muon" for the matrices of hidden layers and AdamW for the rest
+    optimizer: str = ADAMW
+    # learning rate after warm-up
     optimizer_lr: float = 2e-5
     # AdamW's decay rates of the two moments
     optimizer_betas: tuple[float, float] = (0.9, 0.95)
@@ -132,7 +136,7 @@ class ChunkConfig(ConfigWithEnvironment):
         return ["chunk of 1" if size == 1 else f"chunk of {size}, {self.n_action_steps} executed"]
 
     def get_optimizer_preset(self) -> AdamWConfig:
-        return adamw(self)
+        return optimizer(self)
 
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
         return cosine_decay(self)

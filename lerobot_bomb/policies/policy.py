@@ -35,7 +35,8 @@ from lerobot_bomb.hub.policy import HubPolicy
 from lerobot_bomb.policies.config import ChunkConfig, VlaConfig
 from lerobot_bomb.policies.relative_config import RelativeVlaConfig
 from lerobot_bomb.training.distributed import SavesTiedWeightsOnce
-from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_fit, trained_with
+from lerobot_bomb.training.muon import parameter_groups
+from lerobot_bomb.training.policy_flags import MUON, check_as_trained, check_weights_fit, trained_with
 from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.inputs import read_state, read_task, read_tensor
 from lerobot_bomb.vlm.layout import INSTRUCTION, PromptLayout
@@ -131,7 +132,9 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self.action_unit.copy_(torch.from_numpy(high - low) / 2)
         self._action_names = dim_names(meta.features[ACTION])
 
-    def get_optim_params(self) -> list[nn.Parameter]:
+    def get_optim_params(self) -> list[Any]:
+        if self.config.optimizer == MUON:
+            return parameter_groups(self)
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
     def reset(self) -> None:

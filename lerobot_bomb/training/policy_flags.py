@@ -10,8 +10,10 @@ from typing import Any
 
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
+from lerobot_bomb.training.muon import MuonConfig
 from lerobot_bomb.vlm.tokenizer import NANO
 
+ADAMW, MUON = OPTIMIZERS = "adamw", "muon"
 MAX_POSITIONS = 128_000  # of Qwen2.5-VL; LeRobot lists a chunk's frames before it builds a policy
 
 
@@ -196,9 +198,9 @@ def action_deltas(config: Any) -> list[int] | None:
     return None if config.chunk_size == 1 else list(range(config.chunk_size))
 
 
-def adamw(config: Any) -> AdamWConfig:
-    """Build AdamW's config from the fields optimizer_*."""
-    return AdamWConfig(
+def optimizer(config: Any) -> AdamWConfig:
+    """Build the optimizer's config from the fields optimizer*."""
+    return (MuonConfig if config.optimizer == MUON else AdamWConfig)(
         lr=config.optimizer_lr,
         betas=config.optimizer_betas,
         eps=config.optimizer_eps,

@@ -108,7 +108,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     def parameter_counts(self) -> dict[str, int]:
         """Number of parameters of each part, and of all that are trained."""
         counts = {name: sum(p.numel() for p in part.parameters()) for name, part in self.named_children()}
-        return {**counts, "trained": sum(p.numel() for p in self.get_optim_params())}
+        return {**counts, "trained": sum(p.numel() for p in self.parameters() if p.requires_grad)}
 
     def scored(self) -> ScoredFdvla:
         """Return the policy as `lerobot_bomb.explain` scores its answers."""
