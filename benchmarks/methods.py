@@ -93,6 +93,7 @@ VERSIONS = {
     "fdvla_flow": Version(FDVLA, ("--policy.use_denoise_head=false",)),
     "fdvla_noise": Version(FDVLA, ("--policy.use_flow_head=false",)),
     "fdvla_acts_at_once": Version(FDVLA, ("--policy.pointing=false",)),
+    "fdvla_adamw": Version(FDVLA, ("--policy.optimizer=adamw",)),
     "fdvla_no_scenes": Version(FDVLA, data="no_scenes"),
     "fdvla_relabelled": Version(FDVLA, relabels=True),
 }
@@ -106,6 +107,7 @@ PARTS = {
     "Ego3D": {"none": GRID, "true depth": "grid_depth"},
     "chunk": {"1": "fdvla_chunk_1", "4": "fdvla_chunk_4", "8": FDVLA},
     "heads": {"flow": "fdvla_flow", "noise": "fdvla_noise", "both": FDVLA},
+    "optimizer": {"AdamW": "fdvla_adamw", "Muon": FDVLA},
     "pointing": {"off": "fdvla_acts_at_once", "on": FDVLA},
     "static scenes": {"off": "fdvla_no_scenes", "on": FDVLA},
     "DAgger": {"off": FDVLA, "on": "fdvla_relabelled"},

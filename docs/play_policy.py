@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from lerobot_bomb.bomb.observation import CAMERAS, STATE_DIM
 from lerobot_bomb.bomb.suite import find_suite
+from lerobot_bomb.bomb.suites import OWN_SUITES
 from lerobot_bomb.checkpoints.folder import Postprocessor, Preprocessor, load_processors, read_config
 from lerobot_bomb.checkpoints.shipped import shipped_checkpoint
 from lerobot_bomb.evaluation.predictions import load_network
@@ -58,6 +59,8 @@ class Query(nn.Module):
         batch[OBS_STATE] = (state_1S - self.state_mean) / (self.state_std + self._eps)
         batch |= {OBS_LANGUAGE_TOKENS: ids_1L, OBS_LANGUAGE_ATTENTION_MASK: mask_1L}
         context = self.policy._read(batch)
+        if self.policy.pointer is not None:
+            context = self.policy._pointing(context, batch[OBS_STATE])
         no_noise = noise_1KD.new_zeros(1, 0, *noise_1KD.shape[1:])  # that only the sampler `sde` adds
         (actions_1KD,) = self.policy._sample(noise_1KD, no_noise, *context.tensors())
         return actions_1KD[0] * self.action_std + self.action_mean
@@ -103,7 +106,7 @@ def traceable(policy: Any) -> Iterator[None]:
 
 
 def export(name: str, instructions: set[str], folder: Path) -> None:
-    """Write graph and `policy.json` of a policy that does not point and can read all these instructions."""
+    """Write graph and `policy.json` of a policy that can read all these instructions."""
     policy, before, after = load(name)
     query = Query(policy, before, after).eval()
     tokenizer_step: Any = next(step for step in before.steps if isinstance(step, TaskTokenizerStep))
@@ -125,7 +128,7 @@ def export(name: str, instructions: set[str], folder: Path) -> None:
     config = query.policy.config
     shape = 1, config.chunk_size, query.policy.action_dim
     noise = []
-    for _ in range(find_suite(config.environment.task).max_steps):
+    for _ in range(max(find_suite(suite).max_steps for suite in OWN_SUITES)):
         noise.append(query.policy._noise(None, shape))
         query.policy._step_noise(shape)
     assert tokenizer_step.tokenizer is not None

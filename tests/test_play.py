@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import make_play
 import numpy as np
 import pytest
 import torch
+from play_episodes import ROBOT, start_of
 from play_policy import load
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS, EpisodeSpec, Stage
@@ -24,7 +26,10 @@ from lerobot_bomb.bomb.perturbations import AXES
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.bomb.suites import OWN_SUITES
+from lerobot_bomb.conditions import MAX_LEVEL, NONE
 from lerobot_env_bomb.bomb.env import BombEnv
+from lerobot_env_bomb.bomb.perturb import perturb
+from lerobot_env_bomb.bomb.scene import Scene
 
 RUNNER = Path(__file__).parent / "fixtures" / "play.mjs"
 ACTOR = RUNNER.with_name("play_policy.mjs")
@@ -50,23 +55,26 @@ needs_browser = pytest.mark.skipif(
 )
 
 
-def job(suite: str, task: int, seed: int, axis: str | None = None, level: int = 0) -> dict[str, Any]:
-    """An episode that both sides play."""
-    return {"suite": suite, "task": task, "seed": seed, "axis": axis, "level": level}
+def job(suite: str, task: int, seed: int, **levels: int) -> dict[str, Any]:
+    """An episode that both sides play, with {axis: level}."""
+    return {"suite": suite, "task": task, "seed": seed, "levels": levels}
+
+
+def spec_of(suite: str, task: int, seed: int, levels: dict[str, int]) -> EpisodeSpec:
+    """Return what identifies a job's episode in Python."""
+    condition = "+".join(f"{axis}:{level}" for axis, level in levels.items()) or NONE
+    return replace(find_suite(suite).of_task(EpisodeSpec(seed, suite), task), perturbations=condition)
 
 
 def play(
     suite: str,
     task: int,
     seed: int,
-    axis: str | None,
-    level: int,
+    levels: dict[str, int],
     act: Callable[[PrivilegedState], np.ndarray] = expert_action,
 ) -> dict[str, Any]:
     """Play an episode in Python; return how it ends, and its actions."""
-    spec = find_suite(suite).of_task(EpisodeSpec(seed, suite), task)
-    spec = replace(spec, perturbations="none" if axis is None else f"{axis}:{level}")
-    env = BombEnv(spec, RenderOptions(image_size=32))
+    env = BombEnv(spec_of(suite, task, seed, levels), RenderOptions(image_size=32))
     observation, info = env.reset(seed=seed)
     instruction, actions, has_ended = env.task_description, [], False
     while not has_ended:
@@ -85,9 +93,9 @@ def play(
     }
 
 
-def in_node(page: Path, jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def in_node(page: Path, jobs: list[dict[str, Any]], *flags: str) -> list[dict[str, Any]]:
     """Play episodes in JavaScript; return how they end."""
-    command = ["node", RUNNER, page]
+    command = ["node", RUNNER, page, *flags]
     node = subprocess.run(command, input=json.dumps(jobs), capture_output=True, text=True, check=True)
     return json.loads(node.stdout)
 
@@ -117,8 +125,33 @@ def check_alike(page: Path, jobs: list[dict[str, Any]]) -> list[float]:
 @needs_mujoco
 def test_episodes_end_as_in_python(page: Path) -> None:
     jobs = [job(suite, task, SEEDS[0]) for suite, task in zip(OWN_SUITES, (2, 10, 3, 17, 3), strict=True)]
-    jobs += [job("place", 3, SEEDS[1], axis, 5) for axis in ("dynamics", "object", "stones", "language")]
+    jobs += [job("place", 3, SEEDS[1], **{axis: 5}) for axis in ("dynamics", "object", "stones", "language")]
+    jobs.append(job("place", 3, SEEDS[1], stones=4, start=4, dynamics=3, object=3))
     check_alike(page, jobs)
+
+
+@needs_mujoco
+def test_axes_together_change_what_they_change_in_python(page: Path) -> None:
+    rng = np.random.default_rng(0)
+    jobs = []
+    for i in range(40):
+        suite = OWN_SUITES[i % len(OWN_SUITES)]
+        axes = rng.permutation(list(AXES))[: rng.integers(2, len(AXES) + 1)]
+        levels = {axis: int(rng.integers(1, MAX_LEVEL + 1)) for axis in AXES if axis in axes}
+        jobs.append(job(suite, int(rng.integers(find_suite(suite).num_tasks)), SEEDS[i % 2], **levels))
+    scene = Scene(ROBOT)
+    for each, there in zip(jobs, in_node(page, jobs, "--starts"), strict=True):
+        spec = spec_of(**each)
+        drawn = perturb(find_suite(spec.suite).sample(spec))
+        scene.reset(drawn.layout, drawn.perturbation.model_edits, drawn.pattern)
+        assert there["instruction"] == drawn.turns[0].instruction
+        assert there["stones"] == start_of(drawn)["stones"], each
+        for name, values in there["arrays"].items():
+            here = getattr(scene.model, name)
+            found = np.array(values).reshape(here.shape)
+            if name == "geom_rgba":  # what is hidden may have any colour
+                here, found = (np.where(rgba[:, 3:] > 0, rgba, 0) for rgba in (here, found))
+            assert np.allclose(found, here, rtol=1e-5, atol=1e-7), (each, name)
 
 
 @pytest.mark.long
@@ -128,7 +161,7 @@ def test_many_episodes_end_as_in_python(page: Path, suite: str) -> None:
     tasks = range(min(find_suite(suite).num_tasks, 10))
     apart_m = check_alike(page, [job(suite, task, seed) for task in tasks for seed in SEEDS])
     assert sum(each < CLOSE_M for each in apart_m) >= 10
-    check_alike(page, [job(suite, 5, SEEDS[1], axis, level) for axis in AXES for level in (3, 5)])
+    check_alike(page, [job(suite, 5, SEEDS[1], **{axis: level}) for axis in AXES for level in (3, 5)])
 
 
 def still(state: PrivilegedState) -> np.ndarray:
@@ -211,11 +244,11 @@ def test_every_task_and_axis_is_there(page: Path) -> None:
 
 
 def queries(name: str, seeds: range, max_steps: int) -> tuple[list[dict[str, Any]], np.ndarray]:
-    """Observations of a shipped policy's episodes, and its (N, D) actions."""
+    """Observations of a shipped policy's episodes in all suites, and its (N, D) actions."""
     policy, before, after = load(name)
-    env = BombEnv(EpisodeSpec(0, "place"), RenderOptions(image_size=64))
     observations, actions = [], []
-    for seed in seeds:
+    for suite, seed in product(OWN_SUITES, seeds):
+        env = BombEnv(EpisodeSpec(0, suite), RenderOptions(image_size=64))
         policy.reset()
         observation, _ = env.reset(seed=seed)
         for step in range(max_steps):
@@ -236,7 +269,7 @@ def queries(name: str, seeds: range, max_steps: int) -> tuple[list[dict[str, Any
             observation, _, terminated, truncated, _ = env.step(action)
             if terminated or truncated:
                 break
-    env.close()
+        env.close()
     return observations, np.stack(actions)
 
 
@@ -249,7 +282,7 @@ def to_tensor(image: np.ndarray) -> torch.Tensor:
 @needs_mujoco
 @needs_exporter
 def test_the_policy_acts_as_in_python(page: Path) -> None:
-    observations, actions = queries(make_play.POLICY["name"], range(1000, 1014), max_steps=15)
+    observations, actions = queries(make_play.POLICY["name"], range(1000, 1003), max_steps=15)
     assert len(observations) >= 200
     command = ["node", ACTOR, page]
     node = subprocess.run(command, input=json.dumps(observations), capture_output=True, text=True, check=True)
@@ -285,10 +318,11 @@ def test_a_sentence_a_click_and_keys_put_the_stone_there(visit: dict[str, Any]) 
 @needs_mujoco
 @needs_browser
 def test_a_perturbed_episode_stands_beside_the_clean_one(visit: dict[str, Any]) -> None:
-    assert visit["compared"]["titles"] == ["Seed 1001, dynamics 5", "Same seed, clean"]
+    assert visit["compared"]["titles"] == ["Seed 1001, camera 2, dynamics 5", "Same seed, clean"]
     assert all(each.startswith("Success") for each in visit["compared"]["outcomes"])
     assert (
-        "--env.task=goal --env.perturbations='[\"dynamics:5\"]' --seed=1001" in visit["compared"]["command"]
+        "--env.task=goal --env.perturbations='[\"camera:2+dynamics:5\"]' --seed=1001"
+        in visit["compared"]["command"]
     )
     assert len(visit["tabs"]) == 2 and all(each.startswith("Success") for each in visit["tabs"])
 
@@ -298,8 +332,17 @@ def test_a_perturbed_episode_stands_beside_the_clean_one(visit: dict[str, Any]) 
 @needs_browser
 def test_a_shipped_policy_acts_in_the_page(visit: dict[str, Any]) -> None:
     assert visit["policy"]["outcomes"][1].startswith("Success")  # on the clean scene
-    assert "--policy.path=bomb:fdvla" in visit["policy"]["command"]
-    assert "was trained in suite place" in visit["policy"]["elsewhere"]
+    assert "--policy.path=bomb:fdvla_suites" in visit["policy"]["command"]
+
+
+@pytest.mark.long
+@needs_mujoco
+@needs_browser
+def test_sliders_perturb_and_a_button_ends_it(visit: dict[str, Any]) -> None:
+    sliders = visit["sliders"]
+    assert sliders["hash"].endswith("&perturbations=light:2+language:1")
+    assert sliders["titles"] == ["Seed 1000, light 2, language 1", "Same seed, clean"]
+    assert (sliders["after"], sliders["level"]) == ("#suite=place&seed=1000", "0")
 
 
 @pytest.mark.long
@@ -316,7 +359,8 @@ def test_a_shipped_policy_acts_in_the_page(visit: dict[str, Any]) -> None:
         "markup": "does not understand “<img",
         "#suite=chess": "goal, long, object, place, spatial",
         "#seed=3": "it goes from 1000 to 1001",
-        "#axis=camera&level=9": "it goes from 1 to 5",
+        "#perturbations=camera:9": "level of camera “9”; it goes from 1 to 5",
+        "#perturbations=fog:1": "perturbation “fog”; there are table, ",
         "#task=50": "Suite place has tasks 0 to 49",
         "#suite=place&mode=x": "“mode”",
     }.items(),

@@ -2,14 +2,14 @@
 import { POLICY, SEEDS, SUITES, perturbations } from "./constants.js";
 
 const { AXES, MAX_LEVEL } = perturbations;
-export const DEFAULT_CHOICE = { suite: "place", seedPlace: 0, task: null, axis: null, level: 3, policy: null };
-const NAMES = ["suite", "seed", "task", "axis", "level", "policy"];
+export const DEFAULT_CHOICE = { suite: "place", seedPlace: 0, task: null, levels: {}, policy: null };
+const NAMES = ["suite", "seed", "task", "perturbations", "policy"];
 
 /** A choice as the part of an address after "#"; task null: the seed's; policy null: the expert acts. */
-export function hashOf({ suite, seedPlace, task, axis, level, policy }) {
+export function hashOf({ suite, seedPlace, task, levels, policy }) {
   const words = [`suite=${suite}`, `seed=${SEEDS[seedPlace]}`];
   if (task !== null) words.push(`task=${task}`);
-  if (axis !== null) words.push(`axis=${axis}`, `level=${level}`);
+  if (isPerturbed(levels)) words.push(`perturbations=${conditionOf(levels)}`);
   if (policy !== null) words.push(`policy=${policy}`);
   return `#${words.join("&")}`;
 }
@@ -19,30 +19,43 @@ export function choiceOf(hash) {
   const asked = Object.fromEntries(new URLSearchParams(hash.replace(/^#/, "")));
   const unknown = Object.keys(asked).filter((name) => !NAMES.includes(name));
   if (unknown.length > 0) throw new Error(`The link asks for “${unknown[0].slice(0, 40)}”, which this page does not have.`);
-  const oneOf = (name, names) => {
-    if (names.includes(asked[name])) return asked[name];
-    throw new Error(`The link asks for ${name} “${asked[name].slice(0, 40)}”; there are ${names.join(", ")}.`);
+  const oneOf = (name, names, word = asked[name]) => {
+    if (names.includes(word)) return word;
+    throw new Error(`The link asks for ${name} “${word.slice(0, 40)}”; there are ${names.join(", ")}.`);
   };
-  const number = (name, low, high) => {
-    if (/^\d+$/.test(asked[name]) && asked[name] >= low && asked[name] <= high) return Number(asked[name]);
-    throw new Error(`The link asks for ${name} “${asked[name].slice(0, 40)}”; it goes from ${low} to ${high}.`);
+  const number = (name, low, high, word = asked[name]) => {
+    if (/^\d+$/.test(word) && word >= low && word <= high) return Number(word);
+    throw new Error(`The link asks for ${name} “${word.slice(0, 40)}”; it goes from ${low} to ${high}.`);
   };
+  const levels = (condition) =>
+    condition.split(/[ +]/).map((part) => {
+      const [axis, level = ""] = part.split(":");
+      return [oneOf("perturbation", Object.keys(AXES), axis), number(`level of ${axis}`, 1, MAX_LEVEL, level)];
+    });
   const choice = { ...DEFAULT_CHOICE };
   if ("suite" in asked) choice.suite = oneOf("suite", SUITES);
   if ("seed" in asked) choice.seedPlace = SEEDS.indexOf(number("seed", SEEDS[0], SEEDS.at(-1)));
   if ("task" in asked) choice.task = number("task", 0, Infinity);
-  if ("axis" in asked) choice.axis = oneOf("axis", Object.keys(AXES));
+  if ("perturbations" in asked) choice.levels = Object.fromEntries(levels(asked.perturbations));
   if ("policy" in asked) choice.policy = oneOf("policy", [POLICY.name]);
-  if ("level" in asked) choice.level = number("level", 1, MAX_LEVEL);
   return choice;
 }
 
+export function isPerturbed(levels) {
+  return Object.keys(levels).length > 0;
+}
+
+/** {axis: level} as --env.perturbations has it. */
+function conditionOf(levels) {
+  return Object.entries(levels).map(([axis, level]) => `${axis}:${level}`).join("+");
+}
+
 /** The commands that repeat a choice: an evaluation, and a video. */
-export function commandsOf({ suite, seedPlace, task, axis, level, policy }) {
+export function commandsOf({ suite, seedPlace, task, levels, policy }) {
   const seed = `--seed=${SEEDS[seedPlace]}`;
   const flags = [`--env.task=${suite}`];
   if (task !== null) flags.push(`--env.task_ids='[${task}]'`);
-  const condition = axis === null ? null : `${axis}:${level}`;
+  const condition = isPerturbed(levels) ? conditionOf(levels) : null;
   const checkpoint = `--policy.path=bomb:${policy} --policy.device=cpu`;
   return {
     eval: [

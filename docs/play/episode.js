@@ -5,13 +5,25 @@ import { expertAction } from "./expert.js";
 import { Judge } from "./judge.js";
 import { Actuator } from "./scene.js";
 
-/** The episode of a task with a seed's place in SEEDS; `axis` null: without perturbation. */
-export function drawEpisode(suite, task, seedPlace, axis, level) {
+/** The episode of a task with a seed's place in SEEDS, perturbed by {axis: level}. */
+export function drawEpisode(suite, task, seedPlace, levels) {
   const nominal = suite.episodes[task][seedPlace];
-  const change = axis === null ? {} : nominal.axes[axis][level - 1];
-  const episode = { ...nominal, ...change };
-  const edits = [episode.pattern, episode.edit].filter((number) => number !== null && number !== undefined);
-  return { ...episode, edits: edits.map((number) => suite.edits[number]) };
+  const changes = Object.entries(levels).map(([axis, level]) => nominal.axes[axis][level - 1]);
+  const edits = [nominal.pattern, ...changes.map((change) => change.edit)]
+    .filter((number) => number !== null && number !== undefined)
+    .map((number) => suite.edits[number]);
+  return Object.assign({}, nominal, ...changes, { stones: stonesOf(nominal.stones, changes), edits });
+}
+
+/** The stones of an episode whose axes each move or add some of them. */
+function stonesOf(nominal, changes) {
+  const stones = [...nominal];
+  for (const each of changes) {
+    each.stones?.forEach((stone, i) => {
+      if (String(stone) !== String(nominal[i])) stones[i] = stone;
+    });
+  }
+  return stones;
 }
 
 /** A run of an episode, to be advanced substep by substep. */

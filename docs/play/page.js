@@ -1,6 +1,6 @@
 // The page: its controls, the loop that simulates and draws, and its messages.
 import { nearestIntersection } from "./board.js";
-import { DEFAULT_CHOICE, choiceOf, commandsOf, hashOf, notesOf } from "./choice.js";
+import { DEFAULT_CHOICE, choiceOf, commandsOf, hashOf, isPerturbed, notesOf } from "./choice.js";
 import { POLICY, SEEDS, SUITES, board, episode as rules, perturbations } from "./constants.js";
 import { Drawer, pointAt } from "./draw.js";
 import { Run, drawEpisode } from "./episode.js";
@@ -50,20 +50,21 @@ class Page {
       byId(id).replaceChildren(...options.map(([value, text]) => new Option(text, value)));
     fill("suite", SUITES.map((name) => [name, name]));
     fill("seed", SEEDS.map((seed, place) => [place, seed]));
-    fill("axis", [["", "none"], ...Object.keys(AXES).map((name) => [name, name.replace("_", " ")])]);
     fill("policy", [["", "the scripted expert"], [POLICY.name, `the policy bomb:${POLICY.name}`]]);
-    byId("level").max = MAX_LEVEL;
+    byId("axes").replaceChildren(...Object.keys(AXES).map(newSlider));
   }
 
   _listen() {
     const change = (id, made) =>
       byId(id).addEventListener("input", () => this._tell(() => this._show({ ...this._choice, ...made(byId(id).value) })));
-    change("suite", (suite) => ({ suite, task: null, policy: null }));
+    change("suite", (suite) => ({ suite, task: null }));
     change("seed", (place) => ({ seedPlace: Number(place) }));
     change("task", (task) => ({ task: task === "" ? null : Number(task) }));
     change("policy", (policy) => ({ policy: policy || null }));
-    change("axis", (axis) => ({ axis: axis || null }));
-    change("level", (level) => ({ level: Number(level) }));
+    for (const axis of Object.keys(AXES)) {
+      change(`axis-${axis}`, (level) => ({ levels: levelsOf({ ...this._choice.levels, [axis]: Number(level) }) }));
+    }
+    byId("unperturbed").addEventListener("click", () => this._tell(() => this._show({ ...this._choice, levels: {} })));
     byId("sentence-form").addEventListener("submit", (event) => {
       event.preventDefault();
       this._tell(() => this._obey(byId("sentence").value));
@@ -100,24 +101,22 @@ class Page {
     if (choice.task !== null && choice.task >= numTasks) {
       throw new Error(`Suite ${choice.suite} has tasks 0 to ${numTasks - 1}; there is no task ${choice.task}.`);
     }
-    if (choice.axis === "dynamics") this._noise ??= await readJson("noise.json");
-    if (choice.policy !== null && choice.suite !== POLICY.suite) {
-      throw new Error(`bomb:${POLICY.name} was trained in suite ${POLICY.suite}; here the expert acts.`);
-    }
+    if ("dynamics" in choice.levels) this._noise ??= await readJson("noise.json");
     const act = choice.policy === null ? undefined : await this._policy();
     if (ticket !== this._ticket) return; // the visitor has chosen something else meanwhile
     this._choice = choice;
-    const { seedPlace, axis, level } = choice;
-    const shown = axis === null ? [null] : [axis, null];
+    const { seedPlace, levels } = choice;
+    const shown = isPerturbed(levels) ? [levels, {}] : [{}];
     while (this._scenes.length < shown.length) this._scenes.push(new Scene(this._mujoco, this._files));
     while (this._views.length < shown.length) this._views.push(this._newView());
     byId("runs").classList.toggle("compare", shown.length > 1);
     byId("runs").replaceChildren(...shown.map((_, i) => this._views[i].element));
     this._runs = shown.map((each, i) => {
-      const episode = drawEpisode(record, this._task(record), seedPlace, each, level);
+      const episode = drawEpisode(record, this._task(record), seedPlace, each);
       const run = new Run(this._scenes[i], record, episode, this._noise?.[SEEDS[seedPlace]], act);
-      const clean = shown.length > 1 ? "Same seed, clean" : `Seed ${SEEDS[seedPlace]}`;
-      this._views[i].show(run, each === null ? clean : `Seed ${SEEDS[seedPlace]}, ${each.replace("_", " ")} ${level}`);
+      const isClean = i > 0;
+      const words = Object.entries(each).map(([axis, level]) => `${spaced(axis)} ${level}`);
+      this._views[i].show(run, isClean ? "Same seed, clean" : [`Seed ${SEEDS[seedPlace]}`, ...words].join(", "));
       return run;
     });
     this._update(record);
@@ -129,7 +128,7 @@ class Page {
     if (this._act !== undefined) return this._act;
     const play = byId("play");
     play.disabled = true;
-    play.textContent = "Loading the policy: 9 MB …";
+    play.textContent = "Loading the policy: 7 MB …";
     try {
       const policy = await loadPolicy(this._mujoco, this._scenes[0].model);
       this._act = (run) => policy.act(run);
@@ -152,7 +151,7 @@ class Page {
 
   /** Write the choice into controls, link and commands. */
   _update(record) {
-    const { suite, seedPlace, task, axis, level, policy } = this._choice;
+    const { suite, seedPlace, task, levels, policy } = this._choice;
     const isPlace = suite === "place";
     const label = (number) => {
       if (!isPlace) return record.episodes[number][seedPlace].instructions[0];
@@ -165,13 +164,13 @@ class Page {
     byId("seed").value = seedPlace;
     byId("task").value = task ?? "";
     byId("policy").value = policy ?? "";
-    byId("policy").disabled = suite !== POLICY.suite;
-    byId("axis").value = axis ?? "";
-    byId("level").value = level;
-    byId("level").disabled = axis === null;
-    byId("level-number").textContent = axis === null ? "" : level;
-    const notes = axis === null ? [] : notesOf(axis, level);
-    byId("axis-note").replaceChildren(...notes.map((note) => Object.assign(document.createElement("li"), { textContent: note })));
+    for (const axis of Object.keys(AXES)) {
+      byId(`axis-${axis}`).value = levels[axis] ?? 0;
+      byId(`level-${axis}`).textContent = levels[axis] ?? 0;
+    }
+    byId("unperturbed").disabled = !isPerturbed(levels);
+    const notes = Object.entries(levels).map(([axis, level]) => notesOf(axis, level));
+    byId("axis-notes").replaceChildren(...notes.map(newNote));
     byId("map-note").textContent = isPlace
       ? "Click, or use the arrow keys and Enter. Stones in the way are drawn anew."
       : "In this suite, choose a task; suite place lets you choose an intersection.";
@@ -273,6 +272,35 @@ class Page {
     for (const [i] of this._runs.entries()) this._views[i].draw();
     this._map.draw(...this._views[0].fromAbove());
   }
+}
+
+/** Those of {axis: level} that are on, in the order of the axes. */
+function levelsOf(levels) {
+  return Object.fromEntries(Object.keys(AXES).filter((axis) => levels[axis] > 0).map((axis) => [axis, levels[axis]]));
+}
+
+function spaced(name) {
+  return name.replace("_", " ");
+}
+
+/** A slider for the level of an axis. */
+function newSlider(axis) {
+  const slider = byId("axis").content.firstElementChild.cloneNode(true);
+  const [label, output, range] = ["label", "output", "input"].map((tag) => slider.querySelector(tag));
+  label.prepend(`${spaced(axis)} `);
+  label.htmlFor = range.id = `axis-${axis}`;
+  output.id = `level-${axis}`;
+  range.max = MAX_LEVEL;
+  return slider;
+}
+
+/** What an axis changes: a line, and a line for each size. */
+function newNote([summary, ...sizes]) {
+  const list = document.createElement("ul");
+  list.replaceChildren(...sizes.map((size) => Object.assign(document.createElement("li"), { textContent: size })));
+  const note = document.createElement("li");
+  note.replaceChildren(summary, list);
+  return note;
 }
 
 function say(text) {

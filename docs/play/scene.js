@@ -7,12 +7,21 @@ const NUM_TRAVEL = Math.max(1, Math.round(scene.TRAVEL_SHARE * NUM_SUBSTEPS));
 const HEADLIGHT = ["headlight.ambient", "headlight.diffuse"];
 const CONTACT = ["geom_contype", "geom_conaffinity", "body_gravcomp"]; // of stones that wait out of sight
 
-/** Change arrays of a model at some places: {array: [flat indices, values there]}. */
-function applyEdit(model, edit) {
+/**
+ * Change arrays of a model at some places: {array: [flat indices, values there]}.
+ *
+ * @param nominal {array: values} that an edit before this one may have changed: both then scale the value
+ */
+function applyEdit(model, edit, nominal = new Map()) {
   for (const [name, change] of Object.entries(edit)) {
     if (name === "stone_rgba") continue;
+    const [places, values] = change;
     const array = arrayOf(model, name);
-    change[0].forEach((place, i) => (array[place] = change[1][i]));
+    const before = nominal.get(name) ?? array;
+    places.forEach((place, i) => {
+      const isChanged = array[place] !== before[place];
+      array[place] = isChanged ? (array[place] * values[i]) / before[place] : values[i];
+    });
   }
 }
 
@@ -46,10 +55,8 @@ export class Scene {
     this._arm = robots.JOINTS.map(address);
     this._pads = hand.PAD_SIDES.map((side) => model.geom(`${side}_pad`).id);
     this._grip = model.site("grip").id;
-    this._nominal = [...scene.EDITABLE, ...CONTACT, ...HEADLIGHT].map((name) => [
-      name,
-      arrayOf(model, name).slice(),
-    ]);
+    const editable = [...scene.EDITABLE, ...CONTACT, ...HEADLIGHT];
+    this._nominal = new Map(editable.map((name) => [name, arrayOf(model, name).slice()]));
     this._stoneOfGeom = new Map(this._rims.map((geom, i) => [geom, i]));
   }
 
@@ -59,7 +66,7 @@ export class Scene {
     this._mujoco.mj_resetData(model, data);
     for (const [name, values] of this._nominal) arrayOf(model, name).set(values);
     this._showStones(episode, edits);
-    for (const edit of edits) applyEdit(model, edit);
+    for (const edit of edits) applyEdit(model, edit, this._nominal);
     const restHeightM = board.BOARD.thickness_m + episode.stone_size[1] / 2;
     const { qpos } = data;
     this._stoneQpos.forEach((start, i) => {
