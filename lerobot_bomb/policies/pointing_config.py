@@ -19,6 +19,7 @@ class PointingVlaConfig(VlaConfig):
         "pointing": False,
         "counterfactual_share": 0.5,
         "board_loss_weight": 1.0,
+        "pointing_loss_weight": 1.0,
     }
 
     # predict a place and a stone first, then the actions; the labels are columns of record --pointing
@@ -27,12 +28,14 @@ class PointingVlaConfig(VlaConfig):
     counterfactual_share: float = 0.5
     # weight of the loss of reading the board off image tokens; 0: off, and the dataset needs no such column
     board_loss_weight: float = 1.0
+    # weight of the loss of pointing; of tokens: of each, beside those of the actions
+    pointing_loss_weight: float = 1.0
 
     def check_flags(self) -> None:
         super().check_flags()
         if not 0 <= self.counterfactual_share <= 1:
             raise ValueError(f"--policy.counterfactual_share={self.counterfactual_share} must lie in 0..1")
-        check_not_negative(self, ("board_loss_weight",))
+        check_not_negative(self, ("board_loss_weight", "pointing_loss_weight"))
 
     @property
     def reads_board(self) -> bool:

@@ -74,13 +74,12 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
 
     RESEARCH: ClassVar[tuple[str, ...]] = (
         *("use_flow_head", "use_denoise_head", "dualmod_flow", "dualmod_denoise", "head_dim", "dualmod_dim"),
-        *("reasoning_pool", "segment_attention", "time_sampling", "pointing_loss_weight"),
+        *("reasoning_pool", "segment_attention", "time_sampling"),
         *("flow_loss_weight", "denoise_loss_weight", "consistency_loss_weight"),
         *("consistency", "consistency_detach", "refine_alpha", "denoise_tau_min", "clip_sample_range"),
         *("noise_seed", "noise_per_episode"),
     )
     NEEDS_STATE: ClassVar[tuple[str, ...]] = (*RelativeVlaConfig.NEEDS_STATE, "pointing")
-    LATER_FIELDS: ClassVar[dict[str, Any]] = {**PlacesVlaConfig.LATER_FIELDS, "pointing_loss_weight": 1.0}
 
     # base model: Hub id, local folder, or "nano", a small model with random weights that needs no network
     vlm_model_name: str = "Qwen/Qwen2.5-VL-3B-Instruct"
@@ -132,9 +131,6 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
     # noise samples on which each chunk of a batch is trained; the prompt is read once for all
     draws_per_chunk: int = 1
 
-    # weight of the loss of pointing
-    pointing_loss_weight: float = 1.0
-
     # "residual", "flow", "ddim", "sde" or "paper"; unset: residual with both heads, else that of the one
     sampler: str | None = None
     # "euler", or "heun" with two evaluations per step
@@ -175,9 +171,7 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
             raise ValueError(
                 "--policy.freeze_vision_encoder=false needs --policy.train_vlm=full: frozen freezes both"
             )
-        check_not_negative(
-            self, ("flow_loss_weight", "denoise_loss_weight", "noise_seed", "pointing_loss_weight")
-        )
+        check_not_negative(self, ("flow_loss_weight", "denoise_loss_weight", "noise_seed"))
         if self.consistency_loss_weight is not None:
             check_not_negative(self, ("consistency_loss_weight",))
         with _policy_flags():

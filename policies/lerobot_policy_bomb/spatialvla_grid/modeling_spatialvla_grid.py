@@ -215,6 +215,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
             pointing_BNH, hidden_BTGH, features_BPH = self._hidden(batch, cells_BTG, pointed.tokens)
             losses_BTG, chosen_BTG = self._losses(hidden_BTGH, cells_BTG)
             losses_BN, chosen_BN = self._pointing_losses(pointing_BNH, pointed.tokens)
+            losses_BN = self.config.pointing_loss_weight * losses_BN
         loss_mask_BTG = loss_mask_BT[..., None].expand_as(losses_BTG)
         loss_mask_BS = torch.cat([pointed.loss_mask, loss_mask_BTG.flatten(1)], dim=1)
         losses_BS = torch.cat([losses_BN, losses_BTG.flatten(1)], dim=1) * loss_mask_BS

@@ -142,6 +142,8 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         losses_BA = cross_entropy(
             logits_BAV.float().flatten(0, 1), answer.labels.flatten(), ignore_index=IGNORED, reduction="none"
         ).view_as(answer.labels)
+        is_pointing_BA = answer.columns < self._num_pointing * numbers.mask.shape[2]
+        losses_BA = torch.where(is_pointing_BA, self.config.pointing_loss_weight * losses_BA, losses_BA)
         if reduction == "none":
             loss = losses_BA.sum(dim=1) / loss_mask_BA.sum(dim=1).clamp(min=1)
         else:
