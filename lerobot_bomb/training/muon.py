@@ -1,7 +1,7 @@
 """Muon, an optimizer for the matrices of hidden layers, beside AdamW for all other parameters.
 
 Keller Jordan et al., "Muon: an optimizer for hidden layers in neural networks" (2024), with steps of AdamW's
-size as in Liu et al., arXiv 2502.16982. `torch.optim.Muon` takes nothing but matrices, and LeRobot trains with
+size as in Liu et al., arXiv 2502.16982. `torch.optim.Muon` takes nothing but matrices, and LeRobot trains by
 one optimizer.
 """
 
