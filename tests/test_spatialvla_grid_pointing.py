@@ -141,6 +141,20 @@ def test_no_loss_of_a_place_that_is_not_meant() -> None:
 
 
 @torch.no_grad()
+def test_a_weight_counts_the_loss_of_pointing_more_than_that_of_cells() -> None:
+    policy = pointing_policy(counterfactual_share=0.0, pointing_loss_weight=3.0, **SINGLY)
+    batch = pointing_batch(policy)
+    cells, _, pointed = policy._targets(batch)
+    pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed.tokens)
+    of_pointing, of_cells = (
+        policy._pointing_losses(pointing_BNH, pointed.tokens)[0],
+        policy._losses(hidden_BTGH, cells)[0],
+    )
+    expected = (3 * of_pointing.sum() + of_cells.sum()) / (of_pointing.numel() + of_cells.numel())
+    assert float(policy(batch)[0]) == pytest.approx(float(expected), rel=1e-5)
+
+
+@torch.no_grad()
 @pytest.mark.parametrize(("num_dims", "options"), [(4, SINGLY), (7, {})])
 def test_at_each_position_all_of_its_tokens_and_no_others_can_win(
     num_dims: int, options: dict[str, Any]

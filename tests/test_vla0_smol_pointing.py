@@ -11,6 +11,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from relative_cases import NAMES, make_dataset
 from torch import Tensor
+from torch.nn.functional import cross_entropy
 from vla0_smol_cases import WORKSPACE, make_batch, make_config, make_policy, numbers_of, sequence
 
 from lerobot_bomb.actions.text import END, IGNORED, SPACE, NumberTokens, TokenRows
@@ -133,6 +134,20 @@ def test_what_is_meant_is_trained_on() -> None:
     numbers = numbers_of(policy, batch)
     assert labelled(policy, numbers) == [14 * [True] + 4 * [False], *3 * [18 * [True]]]
     assert numbers.loss_mask[1:].all()
+
+
+@torch.no_grad()
+def test_a_weight_counts_the_loss_of_pointing_more_than_that_of_actions() -> None:
+    policy = pointing_policy(pointing_loss_weight=3.0)
+    batch = pointing_batch(policy)
+    numbers = policy._numbers(*policy._targets(batch))
+    answer = policy._answer(numbers)
+    logits_BAV = policy._answer_logits(policy.encode_images(batch), policy.prompt(batch), answer.rows)
+    losses_BA = cross_entropy(logits_BAV.mT, answer.labels, ignore_index=IGNORED, reduction="none")
+    weights_BA = torch.where(answer.columns < NUM_NUMBERS * (1 + 3), 3, 1)
+    expected = (weights_BA * losses_BA).sum() / (answer.labels != IGNORED).sum()
+    assert float(policy(batch)[0]) == pytest.approx(float(expected), rel=1e-5)
+    assert 0 < float((weights_BA == 1).float().mean()) < 1
 
 
 def test_of_another_place_the_stone_and_the_next_action_alone_are() -> None:
