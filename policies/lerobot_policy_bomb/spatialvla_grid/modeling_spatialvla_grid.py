@@ -15,7 +15,7 @@ import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 from torch import Tensor, nn
-from torch.nn.functional import cross_entropy, linear
+from torch.nn.functional import cross_entropy, linear, pad
 
 from lerobot_bomb.actions.accuracy import means
 from lerobot_bomb.actions.bins import Bins
@@ -212,12 +212,12 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         self._begin_batch()
         cells_BTG, loss_mask_BT, pointed = self._targets(batch)
         with self.autocast():
-            pointing_BNH, hidden_BTGH, features_BPH = self._hidden(batch, cells_BTG, pointed.tokens)
+            pointing_BNH, hidden_BTGH, features_BPH = self._hidden(batch, cells_BTG, pointed.given)
             losses_BTG, chosen_BTG = self._losses(hidden_BTGH, cells_BTG)
-            losses_BN, chosen_BN = self._pointing_losses(pointing_BNH, pointed.tokens)
+            losses_BN, chosen_BN = self._pointing_losses(pointing_BNH, pointed.meant)
             losses_BN = self.config.pointing_loss_weight * losses_BN
         loss_mask_BTG = loss_mask_BT[..., None].expand_as(losses_BTG)
-        loss_mask_BS = torch.cat([pointed.loss_mask, loss_mask_BTG.flatten(1)], dim=1)
+        loss_mask_BS = pad(loss_mask_BTG.flatten(1), (losses_BN.shape[1], 0), value=True)
         losses_BS = torch.cat([losses_BN, losses_BTG.flatten(1)], dim=1) * loss_mask_BS
         parts = self._cell_parts(chosen_BTG, cells_BTG, loss_mask_BTG) | pointed.parts(chosen_BN)
         if reduction == "none":

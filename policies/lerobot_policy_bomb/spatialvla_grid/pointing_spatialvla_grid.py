@@ -75,18 +75,18 @@ class StoneCells:
 class Target:
     """Tokens ahead of a chunk's cells; without pointing N = 0."""
 
-    tokens: Tensor  # (B, N) int64, among those that may stand there
-    loss_mask: Tensor  # (B, N) bool
+    given: Tensor  # (B, N) int64, among those that may stand there: what the actions follow
+    meant: Tensor  # (B, N) int64, what is to be predicted
 
     @classmethod
     def nothing(cls, batch_size: int, device: torch.device) -> "Target":
         tokens_BN = torch.zeros(batch_size, 0, dtype=torch.int64, device=device)
-        return cls(tokens_BN, tokens_BN.bool())
+        return cls(tokens_BN, tokens_BN)
 
     def parts(self, chosen_BN: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Return which tokens are right, as `means` takes them."""
-        right = zip(NAMES, (chosen_BN == self.tokens).T, self.loss_mask.T, strict=False)
-        return {f"{name}_accuracy": (right_B, loss_mask_B) for name, right_B, loss_mask_B in right}
+        right = zip(NAMES, (chosen_BN == self.meant).T, strict=False)
+        return {f"{name}_accuracy": (right_B, torch.ones_like(right_B)) for name, right_B in right}
 
 
 class CellPointer(nn.Module):
@@ -129,13 +129,15 @@ class CellPointer(nn.Module):
     ) -> tuple[Labels, Target]:
         """Read a batch's labels, actions as LeRobot normalises them, and draw the tokens that are given.
 
-        Counterfactual places carry no loss.
+        The place that is meant is predicted from the prompt alone, also where another one is given.
         """
         labels = Labels.draw(batch, self.places, other_share, policy_type, generator)
-        tokens_B2 = torch.stack([labels.given, self.stones.number_of(labels.stone_xy)], dim=1)
-        loss_mask_B2 = torch.stack([~labels.is_other, torch.ones_like(labels.is_other)], dim=1)
+        stone_B = self.stones.number_of(labels.stone_xy)
+        given_B2, meant_B2 = (
+            torch.stack([place_B, stone_B], dim=1) for place_B in (labels.given, labels.place)
+        )
         others_BD = normalised_actions(labels.other_actions, self.action_bounds)
-        return replace(labels, other_actions=others_BD), Target(tokens_B2, loss_mask_B2)
+        return replace(labels, other_actions=others_BD), Target(given_B2, meant_B2)
 
 
 def make_pointer(config: "SpatialvlaGridConfig", meta: LeRobotDatasetMetadata | None) -> CellPointer | None:
