@@ -101,6 +101,14 @@ def test_tied_embeddings_are_adamws() -> None:
     assert len(groups[False]) == 2
 
 
+def test_a_matrix_that_was_split_is_an_error() -> None:
+    flat = nn.Parameter(torch.ones(12))
+    optimizer = MuonConfig().build([{"params": [flat], IS_MATRIX: True}])
+    flat.grad = torch.ones(12)
+    with pytest.raises(RuntimeError, match=r"FSDP splits; give --policy\.optimizer=adamw"):
+        optimizer.step()
+
+
 def test_another_optimizer_is_an_error() -> None:
     with pytest.raises(FlagError, match=r"--policy\.optimizer=.sgd. is unknown; choose one of: adamw, muon"):
         fdvla_cases.make_config(4, optimizer="sgd")

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from lerobot.optim import AdamWConfig, OptimizerConfig
 from torch import Tensor, nn
+from torch.distributed.tensor import DTensor
 from torch.optim.adamw import adamw
 
 # of Newton and Schulz's iteration as Jordan chose them: five bring all singular values near 1
@@ -92,6 +93,11 @@ class Muon(torch.optim.Optimizer):
 
     def _momentum(self, matrix: Tensor, momentum: float) -> Tensor:
         """Return Nesterov's mean of a matrix's gradients."""
+        if matrix.ndim != 2 or isinstance(matrix, DTensor):
+            raise RuntimeError(
+                "--policy.optimizer=muon needs whole matrices, which FSDP splits; give "
+                "--policy.optimizer=adamw"
+            )
         assert matrix.grad is not None
         state = self.state[matrix]
         if not state:
