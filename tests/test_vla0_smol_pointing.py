@@ -120,7 +120,8 @@ def test_off_there_is_nothing_of_it() -> None:
     assert "stone and destination predicted first" not in policy.config.methods_used()
     # a checkpoint of before keeps its identity
     later = {name: getattr(policy.config, name) for name in policy.config.LATER_FIELDS}
-    expected = {"counterfactual_share": 0.5, "board_loss_weight": 1.0, "pointing_range_m": 0.3}
+    expected = {"counterfactual_share": 0.5, "board_loss_weight": 1.0, "pointing_loss_weight": 1.0}
+    expected["pointing_range_m"] = 0.3
     assert later == {"pointing": False, **expected} == policy.config.LATER_FIELDS
 
 
@@ -150,24 +151,26 @@ def test_a_weight_counts_the_loss_of_pointing_more_than_that_of_actions() -> Non
     assert 0 < float((weights_BA == 1).float().mean()) < 1
 
 
-def test_of_another_place_the_stone_and_the_next_action_alone_are() -> None:
+def test_of_another_place_the_way_and_later_actions_are_not() -> None:
     policy = pointing_policy(counterfactual_share=1.0, mask_max_fraction=0.0).train()
     batch = pointing_batch(policy)
     bins_BN, loss_mask_BN = policy._targets(batch)
     numbers = policy._numbers(bins_BN, loss_mask_BN)
-    stone, place, first, later = 2 * [True], 4 * [False], 4 * [True], 8 * [False]
-    assert labelled(policy, numbers) == 4 * [stone + place + first + later]
+    meant, way, first, later = 4 * [True], 2 * [False], 4 * [True], 8 * [False]
+    assert labelled(policy, numbers) == 4 * [meant + way + first + later]
     # a space says that the number before it ends
-    ends_stone, of_place, of_first = 3 * [True], 4 * [False], 3 * [True]
-    assert numbers.loss_mask[..., 0].tolist() == 4 * [ends_stone + of_place + of_first + later]
+    ends_meant, ends_way, ends_first = 5 * [True], 2 * [False], 3 * [True]
+    assert numbers.loss_mask[..., 0].tolist() == 4 * [ends_meant + ends_way + ends_first + later]
     labels = policy._answer(numbers).labels
-    assert (labels != IGNORED).sum(dim=1).tolist() == 4 * [3 + 3 * 2 + 3 + 3 * 4 + 1]  # and the end
+    assert (labels != IGNORED).sum(dim=1).tolist() == 4 * [5 + 3 * 4 + 3 + 3 * 4 + 1]  # and the end
     for row in range(4):
-        given = [tuple(bins) for bins in bins_BN[row, 2:10].view(4, 2).tolist()]
-        others = [tuple((1000 * PLACES[(row + i) % 4] + 300).round().int().tolist()) for i in (1, 2)]
-        assert given[0] in others and given[1] == given[0]  # the gripper is at the centre
+        place, *given = [tuple(bins) for bins in bins_BN[row, 2:10].view(4, 2).tolist()]
+        meant, *others = [
+            tuple((1000 * PLACES[(row + i) % 4] + 300).round().int().tolist()) for i in range(3)
+        ]
+        assert place == meant and given[0] in others  # as ways, because the gripper is at the centre
         # its action; later ones are those of the demonstration
-        assert given[2:] == [given[0], (300, 300)]
+        assert given[1:] == [given[0], (300, 300)]
         assert policy.action_bins.decode(bins_BN[row, 10:]).allclose(batch["action"][row, 1:].flatten())
 
 
@@ -231,7 +234,7 @@ def test_actions_alone_come_out_whatever_the_decoding() -> None:
 
 
 def forced(policy: Vla0SmolPolicy, batch: dict[str, Any], given_B2: Tensor) -> Tensor:
-    """(B, D) the actions that it writes after a place that it is made to write."""
+    """(B, D) the actions that it writes after the way to a place that it is made to write."""
     assert policy.pointer is not None
     bins = policy.config.n_action_bins
     labels = policy.pointer.labels(batch, 0.0, "vla0_smol", policy.generator)

@@ -26,7 +26,7 @@ from lerobot_policy_bomb.vla0_smol.configuration_vla0_smol import Vla0SmolConfig
 
 # x and y of the stone, of the place, of the way from the gripper to the place
 NUM_NUMBERS = 6
-STONE_NUMBERS, PLACE_NUMBERS = slice(0, 2), slice(2, 4)
+STONE_NUMBERS, PLACE_NUMBERS, WAY_NUMBERS = slice(0, 2), slice(2, 4), slice(4, 6)
 
 
 class TextPointer(DataUnits):
@@ -46,9 +46,12 @@ class TextPointer(DataUnits):
         return replace(labels, other_actions=self.normalised(labels.other_actions))
 
     def bins_of(self, labels: MetricLabels, state_BS: Tensor) -> Tensor:
-        """Return the bins (B, J) int64 of what is given; longer ways are cut to the range."""
+        """Return the bins (B, J) int64 of stone and place that are meant, and of the way to the given place.
+
+        Longer ways are cut to the range.
+        """
         way_B2 = labels.given_xy - self.gripper(state_BS)[:, :2]
-        return self._bins.encode(torch.cat([labels.stone_xy, labels.given_xy, way_B2], dim=1) / self._range_m)
+        return self._bins.encode(torch.cat([labels.stone_xy, labels.place_xy, way_B2], dim=1) / self._range_m)
 
     def pointed_at(self, bins_J: Tensor) -> PointedAt:
         """(J,) int64 written bins -> what is pointed at, in metres."""
@@ -57,9 +60,9 @@ class TextPointer(DataUnits):
 
     @staticmethod
     def loss_mask(labels: MetricLabels) -> Tensor:
-        """Return (B, J) bool; other places are left out, because no observation tells them."""
-        loss_mask_BJ = (~labels.is_other[:, None]).repeat(1, NUM_NUMBERS)
-        loss_mask_BJ[:, STONE_NUMBERS] = True
+        """Return (B, J) bool; ways to other places are left out, because no observation tells them."""
+        loss_mask_BJ = torch.ones(len(labels.is_other), NUM_NUMBERS, dtype=torch.bool).to(labels.is_other)
+        loss_mask_BJ[:, WAY_NUMBERS] = ~labels.is_other[:, None]
         return loss_mask_BJ
 
     def error_parts(self, errors_BJ: Tensor, counted_BJ: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
