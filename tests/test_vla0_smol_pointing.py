@@ -121,7 +121,7 @@ def test_off_there_is_nothing_of_it() -> None:
     # a checkpoint of before keeps its identity
     later = {name: getattr(policy.config, name) for name in policy.config.LATER_FIELDS}
     expected = {"counterfactual_share": 0.5, "board_loss_weight": 1.0, "pointing_loss_weight": 1.0}
-    expected["pointing_range_m"] = 0.3
+    expected |= {"pointing_range_m": 0.3, "optimizer": "adamw"}
     assert later == {"pointing": False, **expected} == policy.config.LATER_FIELDS
 
 

@@ -46,6 +46,8 @@ class ChunkConfig(ConfigWithEnvironment):
 
     # allowed values of flags
     CHOICES: ClassVar[dict[str, tuple]] = {"optimizer": OPTIMIZERS}
+    # see `ConfigWithEnvironment`
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {"optimizer": ADAMW}
     # how state and action may be normalised
     MODES: ClassVar[tuple[NormalizationMode, ...]] = tuple(NormalizationMode)
     # whether a checkpoint's weights fix the number of action dims; text does not

@@ -16,6 +16,7 @@ class PointingVlaConfig(VlaConfig):
 
     # see `ConfigWithEnvironment`
     LATER_FIELDS: ClassVar[dict[str, Any]] = {
+        **VlaConfig.LATER_FIELDS,
         "pointing": False,
         "counterfactual_share": 0.5,
         "board_loss_weight": 1.0,
