@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import spatialvla_grid_pointing_cases
 import test_fdvla_pointing
-import test_spatialvla_grid_pointing
 import test_vla0_smol_pointing
 import torch
 from lerobot.configs import PreTrainedConfig
 from policy_cases import CASES
-from test_spatialvla_grid_pointing import make_dataset
+from spatialvla_grid_pointing_cases import make_dataset
 from torch import Tensor
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
@@ -30,7 +30,7 @@ from lerobot_bomb.policies.pointing import SPOTS
 SMALL = RenderOptions(image_size=32)
 POINTING: dict[str, ModuleType] = {
     "fdvla": test_fdvla_pointing,
-    "spatialvla_grid": test_spatialvla_grid_pointing,
+    "spatialvla_grid": spatialvla_grid_pointing_cases,
     "vla0_smol": test_vla0_smol_pointing,
 }
 # what the families call them
@@ -266,7 +266,7 @@ def test_adapters_train_it_whole(policy_type: str) -> None:
 
 
 def test_a_dataset_without_boards_is_refused(policy_type: str, tmp_path: Path) -> None:
-    meta = make_dataset(tmp_path / "data", test_spatialvla_grid_pointing.PLACES)
+    meta = make_dataset(tmp_path / "data", spatialvla_grid_pointing_cases.PLACES)
     policy_class, cases = type(CASES[policy_type].make_policy()), POINTING[policy_type]
     options = {**cases.POINTING, "board_loss_weight": 1.0, "pointing_range_m": 3.0}
     if policy_type != "vla0_smol":

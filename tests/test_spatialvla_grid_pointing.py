@@ -1,62 +1,17 @@
 """`spatialvla_grid` points, then acts: two tokens ahead of the cells, which are learned and obeyed."""
 
-import json
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from lerobot.configs import PreTrainedConfig
-from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
-from spatialvla_grid_cases import make_batch, make_config, make_policy, rows
+from spatialvla_grid_cases import make_batch, make_policy, rows
+from spatialvla_grid_pointing_cases import NUM_STONES, PLACES, SINGLY, STONES, pointing_batch, pointing_policy
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
-from lerobot_bomb.flag_errors import FlagError
-from lerobot_bomb.policies.pointing import OTHER_ACTIONS, OTHER_PLACES, PLACE, STONE
+from lerobot_bomb.policies.pointing import OTHER_ACTIONS, OTHER_PLACES, PLACE
 from lerobot_policy_bomb.spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 from lerobot_policy_bomb.spatialvla_grid.pointing_spatialvla_grid import StoneCells
-
-PLACES = [[-0.09, 0.09], [0.0, 0.0], [0.09, -0.045], [0.17, 0.0]]
-STONES = StoneCells((-0.13, -0.13), (0.21, 0.13), 0.04)  # 9 x 7
-NUM_STONES = 63
-# a token a dimension
-SINGLY: dict[str, Any] = {
-    "action_groups": [{"dims": [dim], "transform": "identity", "bins": [8]} for dim in range(4)],
-    "grid_distribution": "uniform",
-    "decode_point": "mid",
-}
-# without reading the board: that is in test_board_reader.py
-POINTING: dict[str, Any] = {
-    "pointing": True,
-    "board_loss_weight": 0.0,
-    "pointing_places": PLACES,
-    "pointing_cell_m": STONES.cell_m,
-    "crop_fraction": 1.0,
-    "chunk_size": 2,
-    "n_action_steps": 2,
-}
-
-
-def pointing_policy(seed: int = 0, num_dims: int = 4, **options: Any) -> SpatialvlaGridPolicy:
-    return make_policy(seed, num_dims, **POINTING | options)
-
-
-def pointing_batch(policy: SpatialvlaGridPolicy, batch_size: int = 4) -> dict[str, Any]:
-    """Labels that are a function of the row: places in turn, the next ones as other places."""
-    batch, places = make_batch(policy, batch_size), torch.tensor(PLACES)
-    number_B = torch.arange(batch_size) % len(PLACES)
-    others = torch.stack([places[(number_B + 1) % len(PLACES)], places[(number_B + 2) % len(PLACES)]], dim=1)
-    stone_B3 = torch.tensor([[0.055, -0.025, 0.0], [-0.5, 0.5, 1.0]])[number_B % 2]
-    rest = torch.zeros(batch_size, 2, policy.grids.num_dims - 2)
-    return batch | {
-        PLACE: places[number_B],
-        STONE: stone_B3,
-        OTHER_PLACES: others.flatten(1),
-        # towards the place: what an action for it is
-        OTHER_ACTIONS: torch.cat([5 * others, rest], dim=2).flatten(1),
-    }
 
 
 def test_stones_are_cells_along_y_then_x_and_what_is_beyond_is_in_the_outermost() -> None:
@@ -125,7 +80,7 @@ def test_metrics_of_actions_skip_what_points() -> None:
     pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed.given)
     right = policy._losses(hidden_BTGH, cells)[1] == cells
     assert metrics["token_accuracy"] == pytest.approx(float(right.float().mean()))
-    place = policy._pointing_losses(pointing_BNH, pointed.given)[1][:, 0]
+    place = policy._pointing_losses(pointing_BNH, pointed.meant)[1][:, 0]
     assert metrics["place_accuracy"] == pytest.approx(float((place == torch.arange(4)).float().mean()))
 
 
@@ -150,7 +105,7 @@ def test_a_weight_counts_the_loss_of_pointing_more_than_that_of_cells() -> None:
     cells, _, pointed = policy._targets(batch)
     pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed.given)
     of_pointing, of_cells = (
-        policy._pointing_losses(pointing_BNH, pointed.given)[0],
+        policy._pointing_losses(pointing_BNH, pointed.meant)[0],
         policy._losses(hidden_BTGH, cells)[0],
     )
     expected = (3 * of_pointing.sum() + of_cells.sum()) / (of_pointing.numel() + of_cells.numel())
@@ -310,156 +265,3 @@ def test_it_learns_to_point_and_then_goes_where_it_points(monkeypatch: pytest.Mo
         monkeypatch.setattr(pointer, "slots", lambda _, only=only: [only, slots[1]])
         expected = policy.grids.encode(torch.tensor([5 * x, 5 * y, 0.0, 0.0]))
         assert torch.equal(policy.choose(batch, 1), expected.expand(8, 1, -1)), place
-
-
-# Data and checkpoints
-
-
-NAMES = ["x", "y", "z", "gripper"]
-
-
-@pytest.fixture(scope="module")
-def metas(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LeRobotDatasetMetadata]:
-    folder = tmp_path_factory.mktemp("pointing")
-    return {
-        name: make_dataset(folder / name, PLACES if name == "pointing" else None)
-        for name in ("pointing", "plain")
-    }
-
-
-def make_dataset(root: Path, places: list[list[float]] | None) -> LeRobotDatasetMetadata:
-    """An episode of ten frames, with labels or without."""
-    sizes = {"observation.state": 4, "action": 4}
-    if places is not None:
-        sizes |= {PLACE: 2, STONE: 3, OTHER_PLACES: 4, OTHER_ACTIONS: 8}
-    features: dict[str, Any] = {
-        key: {
-            "dtype": "float32",
-            "shape": (size,),
-            "names": NAMES if size == 4 and key != OTHER_PLACES else None,
-        }
-        for key, size in sizes.items()
-    }
-    dataset = LeRobotDataset.create("test/pointing", fps=10, features=features, root=root, use_videos=False)
-    generator = np.random.default_rng(0)
-    for step in range(10):
-        frame: dict[str, Any] = {
-            key: generator.uniform(-0.5, 2, size).astype(np.float32) for key, size in sizes.items()
-        }
-        if places is not None:
-            xy = np.array(places, np.float32)
-            frame |= {PLACE: xy[step % 4], OTHER_PLACES: xy[[(step + 1) % 4, (step + 2) % 4]].reshape(-1)}
-        dataset.add_frame({**frame, "task": "push"})
-    dataset.save_episode()
-    dataset.finalize()
-    return LeRobotDatasetMetadata("test/pointing", root=root)
-
-
-def changed(checkpoint: Path, **options: Any) -> Any:
-    flags = [f"--{flag}={json.dumps(value)}" for flag, value in options.items()]
-    return PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=flags)
-
-
-def test_places_and_what_other_actions_are_come_from_the_dataset(
-    metas: dict[str, LeRobotDatasetMetadata],
-) -> None:
-    options: dict[str, Any] = {**POINTING, "pointing_places": None}
-    policy = SpatialvlaGridPolicy(make_config(**options), metas["pointing"])
-    assert policy.config.pointing_places is not None
-    assert sorted(policy.config.pointing_places) == sorted(PLACES)
-    assert policy.pointer is not None and metas["pointing"].stats is not None
-    stats = metas["pointing"].stats["action"]
-    highest = torch.from_numpy(np.asarray(stats["max"])).float()
-    batch = pointing_batch(policy) | {OTHER_ACTIONS: highest.repeat(4, 2)}
-    policy.config.counterfactual_share = 1.0
-    cells, _, _ = policy._targets(batch)
-    assert torch.equal(cells[:, 0], policy.grids.encode(torch.ones(4, 4)))
-
-
-def test_grids_adapt_and_what_points_stays(metas: dict[str, LeRobotDatasetMetadata], tmp_path: Path) -> None:
-    old = pointing_policy()
-    old.save_pretrained(tmp_path / "old")
-    loaded = SpatialvlaGridPolicy.from_pretrained(tmp_path / "old")
-    batch = make_batch(old, 2)
-    assert torch.equal(loaded.write(batch, 2), old.write(batch, 2))
-    groups = [
-        {"dims": [0, 1, 2], "transform": "polar", "bins": [4, 8, 6]},
-        {"dims": [3], "transform": "identity", "bins": [16]},
-    ]
-    config = changed(tmp_path / "old", action_groups=groups)
-    new = SpatialvlaGridPolicy.from_pretrained(
-        tmp_path / "old", config=config, dataset_meta=metas["pointing"]
-    )
-    assert new.grids.num_cells == [4 * 8 * 6, 16] != old.grids.num_cells
-    for table in ("cell_embedding.weight", "cell_head.weight"):
-        (of_old, of_new) = (policy.get_parameter(table) for policy in (old, new))
-        assert len(of_new) == 4 * 8 * 6 + 16 + 4 + NUM_STONES
-        assert torch.equal(of_new[-4 - NUM_STONES :], of_old[-4 - NUM_STONES :])
-    new(pointing_batch(new))[0].backward()
-    new.save_pretrained(tmp_path / "new")
-    again = SpatialvlaGridPolicy.from_pretrained(tmp_path / "new")
-    assert torch.equal(again.write(batch, 2), new.write(batch, 2))
-    assert again.config.pointing_places == PLACES
-
-
-# Bad input
-
-
-def test_without_places_there_is_no_policy() -> None:
-    with pytest.raises(ValueError, match=r"--policy\.pointing=true takes the places from a dataset"):
-        make_policy(pointing=True)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"counterfactual_share": 1.5}, r"--policy\.counterfactual_share=1\.5 must lie in 0\.\.1"),
-        ({"pointing_cell_m": 5.0}, r"--policy\.pointing_cell_m=5\.0 must lie in 0\.001\.\.0\.05"),
-        ({"pointing_area_m": [[0, 0], [1]]}, r"--policy\.pointing_area_m=.* must be \[\[x, y\], \[x, y\]\]"),
-        ({"pointing_area_m": [[0, 1], [1, 0]]}, "the second beyond the first"),
-    ],
-)
-def test_wrong_flags_are_named(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(FlagError, match=message):
-        make_config(**POINTING | options)
-
-
-def test_a_start_that_does_not_go_together_is_refused(
-    metas: dict[str, LeRobotDatasetMetadata], tmp_path: Path
-) -> None:
-    make_policy().save_pretrained(tmp_path / "plain")
-    pointing_policy(chunk_size=4, n_action_steps=4).save_pretrained(tmp_path / "pointing")
-    load = SpatialvlaGridPolicy.from_pretrained
-    with pytest.raises(
-        ValueError, match=r"pointing=true is trained on the columns .*which test/pointing lacks"
-    ):
-        load(tmp_path / "pointing", config=changed(tmp_path / "pointing"), dataset_meta=metas["plain"])
-    with pytest.raises(
-        ValueError, match=r"--policy\.pointing=True: the weights of this checkpoint are made for"
-    ):
-        on = changed(tmp_path / "plain", pointing=True)
-        load(tmp_path / "plain", config=on, dataset_meta=metas["pointing"])
-    with pytest.raises(
-        ValueError, match=r"--policy\.pointing=False: the weights of this checkpoint are made"
-    ):
-        off = changed(tmp_path / "pointing", pointing=False)
-        load(tmp_path / "pointing", config=off, dataset_meta=metas["plain"])
-
-
-@pytest.mark.parametrize("with_data", [True, False])
-def test_a_checkpoint_of_before_does_not_point(
-    with_data: bool, metas: dict[str, LeRobotDatasetMetadata], tmp_path: Path
-) -> None:
-    make_policy().save_pretrained(tmp_path)
-    written = json.loads((tmp_path / "config.json").read_text())
-    for name in [name for name in written if name.startswith(("pointing", "counterfactual"))]:
-        del written[name]
-        written["trained_with"].pop(name, None)
-    (tmp_path / "config.json").write_text(json.dumps(written))
-    with pytest.raises(ValueError, match=r"--policy\.pointing=True: .*this checkpoint"):
-        SpatialvlaGridPolicy.from_pretrained(
-            tmp_path,
-            config=changed(tmp_path, pointing=True),
-            dataset_meta=metas["pointing"] if with_data else None,
-        )
-    SpatialvlaGridPolicy.from_pretrained(tmp_path, config=changed(tmp_path))
