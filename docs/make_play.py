@@ -44,7 +44,7 @@ PACKAGES = {
 }
 PACKED = (".bin", ".json", ".onnx", ".wasm", ".xml")  # kinds of files that the page unpacks itself
 # of those that come with the package, for all suites
-POLICY = {"name": "fdvla_suites"}
+POLICY = "fdvla_suites"
 NUM_SEEDS = 20  # from the first of the protocol's seeds on
 
 # whose numbers, names and tables the page uses
@@ -164,7 +164,7 @@ def build(folder: Path, seeds: Sequence[int], *, with_policy: bool = True) -> No
     for suite, record in records.items():
         write_json(folder / f"{suite}.json", record)
     if with_policy:
-        export(POLICY["name"], set().union(*map(instructions_of, records.values())), folder)
+        export(POLICY, set().union(*map(instructions_of, records.values())), folder)
     for path in [path for path in folder.iterdir() if path.suffix in PACKED]:
         pack(path)
     size = sum(path.stat().st_size for path in folder.iterdir())

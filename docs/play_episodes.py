@@ -193,8 +193,12 @@ class SuiteExport:
         return self._numbers[key]
 
 
+def most_steps() -> int:
+    """Return the control steps of the longest episode of any suite."""
+    return max(find_suite(suite).max_steps for suite in OWN_SUITES)
+
+
 def actuator_noise(seed: int) -> list[float]:
     """Standard normal numbers, three for each control step, as the actuator of a seed draws them."""
-    steps = max(find_suite(suite).max_steps for suite in OWN_SUITES)
     rng = generator(seed, Stream.ACTUATOR_NOISE)
-    return rounded(rng.standard_normal(3 * steps), NOISE_DIGITS)
+    return rounded(rng.standard_normal(3 * most_steps()), NOISE_DIGITS)

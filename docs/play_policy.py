@@ -19,11 +19,10 @@ from lerobot.utils.constants import (
     OBS_LANGUAGE_TOKENS,
     OBS_STATE,
 )
+from play_episodes import most_steps
 from torch import Tensor, nn
 
 from lerobot_bomb.bomb.observation import CAMERAS, STATE_DIM
-from lerobot_bomb.bomb.suite import find_suite
-from lerobot_bomb.bomb.suites import OWN_SUITES
 from lerobot_bomb.checkpoints.folder import Postprocessor, Preprocessor, load_processors, read_config
 from lerobot_bomb.checkpoints.shipped import shipped_checkpoint
 from lerobot_bomb.evaluation.predictions import load_network
@@ -128,7 +127,7 @@ def export(name: str, instructions: set[str], folder: Path) -> None:
     config = query.policy.config
     shape = 1, config.chunk_size, query.policy.action_dim
     noise = []
-    for _ in range(max(find_suite(suite).max_steps for suite in OWN_SUITES)):
+    for _ in range(most_steps()):
         noise.append(query.policy._noise(None, shape))
         query.policy._step_noise(shape)
     assert tokenizer_step.tokenizer is not None

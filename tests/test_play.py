@@ -282,7 +282,7 @@ def to_tensor(image: np.ndarray) -> torch.Tensor:
 @needs_mujoco
 @needs_exporter
 def test_the_policy_acts_as_in_python(page: Path) -> None:
-    observations, actions = queries(make_play.POLICY["name"], range(1000, 1003), max_steps=15)
+    observations, actions = queries(make_play.POLICY, range(1000, 1003), max_steps=15)
     assert len(observations) >= 200
     command = ["node", ACTOR, page]
     node = subprocess.run(command, input=json.dumps(observations), capture_output=True, text=True, check=True)

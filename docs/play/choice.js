@@ -37,7 +37,7 @@ export function choiceOf(hash) {
   if ("seed" in asked) choice.seedPlace = SEEDS.indexOf(number("seed", SEEDS[0], SEEDS.at(-1)));
   if ("task" in asked) choice.task = number("task", 0, Infinity);
   if ("perturbations" in asked) choice.levels = Object.fromEntries(levels(asked.perturbations));
-  if ("policy" in asked) choice.policy = oneOf("policy", [POLICY.name]);
+  if ("policy" in asked) choice.policy = oneOf("policy", [POLICY]);
   return choice;
 }
 

@@ -50,7 +50,7 @@ class Page {
       byId(id).replaceChildren(...options.map(([value, text]) => new Option(text, value)));
     fill("suite", SUITES.map((name) => [name, name]));
     fill("seed", SEEDS.map((seed, place) => [place, seed]));
-    fill("policy", [["", "the scripted expert"], [POLICY.name, `the policy bomb:${POLICY.name}`]]);
+    fill("policy", [["", "the scripted expert"], [POLICY, `the policy bomb:${POLICY}`]]);
     byId("axes").replaceChildren(...Object.keys(AXES).map(newSlider));
   }
 

@@ -27,7 +27,7 @@ from lerobot_bomb.training.policy_flags import (
     check_state,
     check_training,
     cosine_decay,
-    optimizer,
+    optimizer_config,
 )
 
 DTYPES = ("float32", "bfloat16")
@@ -138,7 +138,7 @@ class ChunkConfig(ConfigWithEnvironment):
         return ["chunk of 1" if size == 1 else f"chunk of {size}, {self.n_action_steps} executed"]
 
     def get_optimizer_preset(self) -> AdamWConfig:
-        return optimizer(self)
+        return optimizer_config(self)
 
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
         return cosine_decay(self)

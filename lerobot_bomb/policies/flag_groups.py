@@ -18,13 +18,8 @@ SHARED = {
     # for experiments with a method
     "RESEARCH": (
         *("nano_config", "normalization_mapping", "loss_on_padded_actions", "drop_n_last_frames"),
-        *(
-            "optimizer",
-            "optimizer_betas",
-            "optimizer_eps",
-            "optimizer_weight_decay",
-            "optimizer_grad_clip_norm",
-        ),
+        *("optimizer", "optimizer_betas", "optimizer_eps"),
+        *("optimizer_weight_decay", "optimizer_grad_clip_norm"),
         *("temporal_ensemble_weighting", "temporal_ensemble_coefficient", "temperature", "noise_seed"),
         *("counterfactual_share", "board_loss_weight", "pointing_loss_weight", "scheduler_decay_lr"),
     ),

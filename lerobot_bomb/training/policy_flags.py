@@ -198,7 +198,7 @@ def action_deltas(config: Any) -> list[int] | None:
     return None if config.chunk_size == 1 else list(range(config.chunk_size))
 
 
-def optimizer(config: Any) -> AdamWConfig:
+def optimizer_config(config: Any) -> AdamWConfig:
     """Build the optimizer's config from the fields optimizer*."""
     return (MuonConfig if config.optimizer == MUON else AdamWConfig)(
         lr=config.optimizer_lr,

@@ -142,8 +142,8 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         losses_BA = cross_entropy(
             logits_BAV.float().flatten(0, 1), answer.labels.flatten(), ignore_index=IGNORED, reduction="none"
         ).view_as(answer.labels)
-        is_pointing_BA = answer.columns < self._num_pointing * numbers.mask.shape[2]
-        losses_BA = torch.where(is_pointing_BA, self.config.pointing_loss_weight * losses_BA, losses_BA)
+        weighted_BA = self.config.pointing_loss_weight * losses_BA
+        losses_BA = torch.where(self._is_pointing(answer, numbers), weighted_BA, losses_BA)
         if reduction == "none":
             loss = losses_BA.sum(dim=1) / loss_mask_BA.sum(dim=1).clamp(min=1)
         else:
@@ -152,6 +152,10 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         loss, board = self._with_board(loss, batch, features_BPH)
         parts = self._metric_parts(logits_BAV.detach(), answer, numbers, bins_BN) | board
         return loss, means(parts, loss, self.config.trained_batches)
+
+    def _is_pointing(self, answer: Answer, numbers: NumberTokens) -> Tensor:
+        """Return (B, A) bool, the tokens of an answer that are of pointing and not of actions."""
+        return answer.columns < self._num_pointing * numbers.mask.shape[2]
 
     @torch.no_grad()
     def _metric_parts(
@@ -163,8 +167,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         not count. Errors are known only with a dataset, that is in training.
         """
         before = self._num_pointing
-        # what is pointed at is no action
-        loss_mask_BA = (answer.labels != IGNORED) & (answer.columns >= before * numbers.mask.shape[2])
+        loss_mask_BA = (answer.labels != IGNORED) & ~self._is_pointing(answer, numbers)
         right_BA = logits_BAV.argmax(dim=-1) == answer.labels
         digits_BA = logits_BAV[..., self.symbol_ids[:SPACE]].argmax(dim=-1)
         read_BN = read_numbers(numbers, answer.with_padding(digits_BA, numbers))
