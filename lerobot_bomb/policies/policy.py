@@ -12,7 +12,6 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, DONE, OBS_STATE
 from torch import Tensor, nn
-from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from lerobot_bomb.actions.ensemble import TemporalEnsemble
 from lerobot_bomb.actions.relative import RelativeActions, Statistics, bounds, named_dims
@@ -38,6 +37,7 @@ from lerobot_bomb.training.distributed import SavesTiedWeightsOnce
 from lerobot_bomb.training.muon import parameter_groups
 from lerobot_bomb.training.policy_flags import MUON, check_as_trained, check_weights_fit, trained_with
 from lerobot_bomb.training.randomness import begin_batch
+from lerobot_bomb.vlm.attention import Float32Attention
 from lerobot_bomb.vlm.inputs import read_state, read_task, read_tensor
 from lerobot_bomb.vlm.layout import INSTRUCTION, PromptLayout
 from lerobot_bomb.vlm.prompt import task_ids, task_text
@@ -287,9 +287,8 @@ class VlaPolicy(ChunkPolicy):
     def autocast(self) -> Iterator[None]:
         """Use the precision of ``config.dtype`` in training, in evaluation and in a user's own loop."""
         device, bfloat16 = self._device.type, self.config.dtype == "bfloat16"
-        # gradients of torch's fused attention in bfloat16 take four to ten times as long on a CPU
-        plain = sdpa_kernel(SDPBackend.MATH) if bfloat16 and device == "cpu" else nullcontext()
-        with torch.autocast(device, dtype=torch.bfloat16, enabled=bfloat16), plain:
+        attention = Float32Attention() if bfloat16 and device == "cpu" else nullcontext()
+        with torch.autocast(device, dtype=torch.bfloat16, enabled=bfloat16), attention:
             yield
 
     def _make_ensemble(self) -> TemporalEnsemble | None:

@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.functional import linear
 from transformers import (
     AutoConfig,
@@ -25,7 +24,7 @@ from transformers import (
 
 from lerobot_bomb.files import read_json
 from lerobot_bomb.finite import require_finite_weights
-from lerobot_bomb.vlm.attention import attention_bias, causal_mask
+from lerobot_bomb.vlm.attention import Float32Attention, attention_bias, causal_mask
 from lerobot_bomb.vlm.images import resized_pixels
 from lerobot_bomb.vlm.memory import check_memory
 from lerobot_bomb.vlm.presets import INITIALIZER_RANGE, changed, nano_config
@@ -33,12 +32,12 @@ from lerobot_bomb.vlm.tokenizer import NANO, hub_file, load_tokenizer
 
 
 def as_it_was_computed() -> tuple[AbstractContextManager, AbstractContextManager]:
-    """Return contexts of a checkpointed layer and of its recomputation, with the kernels allowed now.
+    """Return contexts of a checkpointed layer and of its recomputation, with attention in the same precision.
 
     Torch itself restores autocast and random state.
     """
-    is_restricted = not torch.backends.cuda.flash_sdp_enabled()
-    return nullcontext(), sdpa_kernel(SDPBackend.MATH) if is_restricted else nullcontext()
+    is_float32 = torch.is_autocast_enabled("cpu")
+    return nullcontext(), Float32Attention() if is_float32 else nullcontext()
 
 
 # modules that autocast casts to bfloat16
