@@ -34,7 +34,8 @@ from lerobot_env_bomb.bomb.scene import Scene
 RUNNER = Path(__file__).parent / "fixtures" / "play.mjs"
 ACTOR = RUNNER.with_name("play_policy.mjs")
 VISITOR = RUNNER.with_name("play_in_browser.mjs")
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+# programs and their arguments before a browser; a headless Firefox has no WebGL without a GPU
+WRAPPERS = {"chromium": [], "firefox": ["xvfb-run", "-a"]}
 SEEDS = TEST_SEEDS[:2]
 CLOSE_M = 1e-4  # of a stone's position at the end, in most episodes
 # in all: where fingers close on a stone, the solver stops one iteration sooner or later, by the last bit
@@ -50,8 +51,8 @@ HAS_EXPORTER = find_spec("onnxscript") is not None
 needs_exporter = pytest.mark.skipif(not HAS_EXPORTER, reason="needs onnxscript, of `make play`")
 
 needs_browser = pytest.mark.skipif(
-    CHROMIUM is None or not HAS_EXPORTER or not (make_play.NODE_MODULES / "playwright-core").is_dir(),
-    reason="needs Chromium, onnxscript and npm's playwright-core: make play NPM_FLAGS=--include=dev",
+    not HAS_EXPORTER or not (make_play.NODE_MODULES / "playwright-core").is_dir(),
+    reason="needs onnxscript and npm's playwright-core: make play NPM_FLAGS=--include=dev",
 )
 
 
@@ -292,10 +293,13 @@ def test_the_policy_acts_as_in_python(page: Path) -> None:
     assert apart.max() < 1e-3
 
 
-@pytest.fixture(scope="module")
-def visit(page: Path) -> dict[str, Any]:
+@pytest.fixture(scope="module", params=WRAPPERS)
+def visit(page: Path, request: pytest.FixtureRequest) -> dict[str, Any]:
     """Try all of the page as a visitor; return what it shows."""
-    command = ["node", VISITOR, page, make_play.NODE_MODULES, str(CHROMIUM)]
+    wrapper, browser = WRAPPERS[request.param], shutil.which(request.param)
+    if browser is None or not all(map(shutil.which, wrapper[:1])):
+        pytest.skip(f"needs {' and '.join([request.param, *wrapper[:1]])}")
+    command = [*wrapper, "node", VISITOR, page, make_play.NODE_MODULES, browser]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
@@ -306,7 +310,7 @@ def test_a_sentence_a_click_and_keys_put_the_stone_there(visit: dict[str, Any]) 
     assert visit["problems"] == []
     for tried in ("sentence", "click", "keyboard"):
         assert visit[tried]["outcomes"][0].startswith("Success after "), visit[tried]
-    assert visit["sentence"]["hash"].endswith("task=13")  # black, row 2, column 3
+    assert "&task=13&words=Put%20a" in visit["sentence"]["hash"]  # black, row 2, column 3
     assert visit["click"]["pressed"] == "row 0, column 4"
     # from the target that seed 1000 draws, a row down and a column to the right
     assert (visit["keyboard"]["from"], visit["keyboard"]["to"]) == ("row 1, column 0", "row 2, column 1")
@@ -333,6 +337,19 @@ def test_a_perturbed_episode_stands_beside_the_clean_one(visit: dict[str, Any]) 
 def test_a_shipped_policy_acts_in_the_page(visit: dict[str, Any]) -> None:
     assert visit["policy"]["outcomes"][1].startswith("Success")  # on the clean scene
     assert "--policy.path=bomb:fdvla_suites" in visit["policy"]["command"]
+
+
+@pytest.mark.long
+@needs_mujoco
+@needs_browser
+def test_a_shipped_policy_reads_the_visitors_own_words(visit: dict[str, Any]) -> None:
+    sentence = "Please move one white piece to the Go board, row 2 and column 1!"
+    words = visit["words"]
+    assert (words["message"], words["instruction"], words["shown"]) == ("", sentence, sentence)
+    assert words["outcomes"][0].startswith(("Success", "Failed"))
+    assert "task=36&words=Please%20move" in words["link"]  # white, row 2, column 1
+    assert "ask for different things" in words["other"]
+    assert words["after"] != sentence
 
 
 @pytest.mark.long

@@ -1,17 +1,21 @@
-// What is shown: suite, seed, task, axis, level and who acts, as the page's address and as flags of a command.
+// What is shown: suite, seed, task, the visitor's words, axes, levels and who acts, as the page's address and as flags of a command.
 import { POLICY, SEEDS, SUITES, perturbations } from "./constants.js";
 
 const { AXES, MAX_LEVEL } = perturbations;
-export const DEFAULT_CHOICE = { suite: "place", seedPlace: 0, task: null, levels: {}, policy: null };
-const NAMES = ["suite", "seed", "task", "perturbations", "policy"];
+export const DEFAULT_CHOICE = { suite: "place", seedPlace: 0, task: null, words: null, levels: {}, policy: null };
+const NAMES = ["suite", "seed", "task", "words", "perturbations", "policy"];
 
-/** A choice as the part of an address after "#"; task null: the seed's; policy null: the expert acts. */
-export function hashOf({ suite, seedPlace, task, levels, policy }) {
-  const words = [`suite=${suite}`, `seed=${SEEDS[seedPlace]}`];
-  if (task !== null) words.push(`task=${task}`);
-  if (isPerturbed(levels)) words.push(`perturbations=${conditionOf(levels)}`);
-  if (policy !== null) words.push(`policy=${policy}`);
-  return `#${words.join("&")}`;
+/**
+ * A choice as the part of an address after "#"; task null: the seed's; words null: the episode's own instruction;
+ * policy null: the expert acts.
+ */
+export function hashOf({ suite, seedPlace, task, words, levels, policy }) {
+  const parts = [`suite=${suite}`, `seed=${SEEDS[seedPlace]}`];
+  if (task !== null) parts.push(`task=${task}`);
+  if (words !== null) parts.push(`words=${encodeURIComponent(words)}`);
+  if (isPerturbed(levels)) parts.push(`perturbations=${conditionOf(levels)}`);
+  if (policy !== null) parts.push(`policy=${policy}`);
+  return `#${parts.join("&")}`;
 }
 
 /** The choice of an address; throws an Error with a message for the visitor. */
@@ -36,6 +40,7 @@ export function choiceOf(hash) {
   if ("suite" in asked) choice.suite = oneOf("suite", SUITES);
   if ("seed" in asked) choice.seedPlace = SEEDS.indexOf(number("seed", SEEDS[0], SEEDS.at(-1)));
   if ("task" in asked) choice.task = number("task", 0, Infinity);
+  if ("words" in asked) choice.words = asked.words;
   if ("perturbations" in asked) choice.levels = Object.fromEntries(levels(asked.perturbations));
   if ("policy" in asked) choice.policy = oneOf("policy", [POLICY]);
   return choice;

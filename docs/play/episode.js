@@ -29,11 +29,13 @@ function stonesOf(nominal, changes) {
 /** A run of an episode, to be advanced substep by substep. */
 export class Run {
   /**
+   * @param words instead of the episode's instruction; null: none
    * @param noise of the arm, where the axis `dynamics` is on
    * @param act called with the run: its next action, or a promise of it; the expert's by default
    */
-  constructor(sceneOfRun, suite, episode, noise, act = actAsExpert) {
+  constructor(sceneOfRun, suite, episode, { words = null, noise, act = actAsExpert } = {}) {
     this.act = act;
+    this._words = words;
     this.isWaiting = false; // for a promised action
     this.scene = sceneOfRun;
     this.episode = episode;
@@ -49,6 +51,7 @@ export class Run {
 
   get instruction() {
     const { instructions } = this.episode;
+    if (this._words !== null) return this._words;
     return instructions[Math.min(this.judge.numMade, instructions.length - 1)];
   }
 

@@ -57,9 +57,9 @@ class Page {
   _listen() {
     const change = (id, made) =>
       byId(id).addEventListener("input", () => this._tell(() => this._show({ ...this._choice, ...made(byId(id).value) })));
-    change("suite", (suite) => ({ suite, task: null }));
+    change("suite", (suite) => ({ suite, task: null, words: null }));
     change("seed", (place) => ({ seedPlace: Number(place) }));
-    change("task", (task) => ({ task: task === "" ? null : Number(task) }));
+    change("task", (task) => ({ task: task === "" ? null : Number(task), words: null }));
     change("policy", (policy) => ({ policy: policy || null }));
     for (const axis of Object.keys(AXES)) {
       change(`axis-${axis}`, (level) => ({ levels: levelsOf({ ...this._choice.levels, [axis]: Number(level) }) }));
@@ -101,6 +101,12 @@ class Page {
     if (choice.task !== null && choice.task >= numTasks) {
       throw new Error(`Suite ${choice.suite} has tasks 0 to ${numTasks - 1}; there is no task ${choice.task}.`);
     }
+    if (choice.words !== null) {
+      const meant = understand(choice.words, shownOf(choice, record));
+      if (meant.suite !== choice.suite || meant.task !== choice.task) {
+        throw new Error("The link's words and its task ask for different things.");
+      }
+    }
     if ("dynamics" in choice.levels) this._noise ??= await readJson("noise.json");
     const act = choice.policy === null ? undefined : await this._policy();
     if (ticket !== this._ticket) return; // the visitor has chosen something else meanwhile
@@ -112,8 +118,9 @@ class Page {
     byId("runs").classList.toggle("compare", shown.length > 1);
     byId("runs").replaceChildren(...shown.map((_, i) => this._views[i].element));
     this._runs = shown.map((each, i) => {
-      const episode = drawEpisode(record, this._task(record), seedPlace, each);
-      const run = new Run(this._scenes[i], record, episode, this._noise?.[SEEDS[seedPlace]], act);
+      const episode = drawEpisode(record, taskOf(choice, record), seedPlace, each);
+      const noise = this._noise?.[SEEDS[seedPlace]];
+      const run = new Run(this._scenes[i], record, episode, { words: choice.words, noise, act });
       const isClean = i > 0;
       const words = Object.entries(each).map(([axis, level]) => `${spaced(axis)} ${level}`);
       this._views[i].show(run, isClean ? "Same seed, clean" : [`Seed ${SEEDS[seedPlace]}`, ...words].join(", "));
@@ -145,13 +152,9 @@ class Page {
     return view;
   }
 
-  _task(record) {
-    return this._choice.task ?? record.drawn[this._choice.seedPlace];
-  }
-
   /** Write the choice into controls, link and commands. */
   _update(record) {
-    const { suite, seedPlace, task, levels, policy } = this._choice;
+    const { suite, seedPlace, task, words, levels, policy } = this._choice;
     const isPlace = suite === "place";
     const label = (number) => {
       if (!isPlace) return record.episodes[number][seedPlace].instructions[0];
@@ -179,26 +182,20 @@ class Page {
     const hash = hashOf(this._choice);
     if (location.hash !== hash) history.replaceState(null, "", hash);
     byId("link").value = location.href;
+    byId("words-note").hidden = words === null;
     const commands = commandsOf(this._choice);
     byId("eval-command").value = commands.eval;
     byId("view-command").value = commands.view;
   }
 
   async _obey(sentence) {
-    const { suite, seedPlace } = this._choice;
-    const record = await this._record(suite);
-    const color = this._color(record);
-    await this._showAndPlay(understand(sentence, { name: suite, record, seedPlace, color }));
-  }
-
-  /** The colour of the stone where a visitor names only its place. */
-  _color(record) {
-    return this._choice.suite === "place" ? placementOf(this._task(record)).color : board.COLORS[0];
+    const record = await this._record(this._choice.suite);
+    await this._showAndPlay(understand(sentence, shownOf(this._choice, record)));
   }
 
   async _choosePlace(intersection) {
     const record = await this._record(this._choice.suite);
-    await this._showAndPlay({ task: placementTask(this._color(record), intersection) });
+    await this._showAndPlay({ task: placementTask(colorOf(this._choice, record), intersection), words: null });
   }
 
   async _choosePoint(view, event) {
@@ -272,6 +269,20 @@ class Page {
     for (const [i] of this._runs.entries()) this._views[i].draw();
     this._map.draw(...this._views[0].fromAbove());
   }
+}
+
+function taskOf(choice, record) {
+  return choice.task ?? record.drawn[choice.seedPlace];
+}
+
+/** The colour of the stone where a visitor names only its place. */
+function colorOf(choice, record) {
+  return choice.suite === "place" ? placementOf(taskOf(choice, record)).color : board.COLORS[0];
+}
+
+/** What `understand` has to know of what is shown. */
+function shownOf(choice, record) {
+  return { name: choice.suite, record, seedPlace: choice.seedPlace, color: colorOf(choice, record) };
 }
 
 /** Those of {axis: level} that are on, in the order of the axes. */

@@ -70,7 +70,7 @@ function asPlainPlacement(text) {
 }
 
 /**
- * What a sentence asks for: {suite, task, seedPlace}.
+ * What a sentence asks for: {suite, task, seedPlace, words}; words null where they are the episode's own.
  *
  * @param shown {name, record, seedPlace, color}: the suite shown, the seed's place, the colour if none is said
  * @throws Error with a message for the visitor
@@ -82,7 +82,7 @@ export function understand(sentence, shown) {
     throw new Error(`That sentence has ${sentence.length.toLocaleString("en")} characters; ${MAX_LENGTH} are the limit.`);
   }
   const known = shown.name === "place" ? null : findInstruction(text, shown);
-  if (known !== null) return { suite: shown.name, ...known };
+  if (known !== null) return { suite: shown.name, ...known, words: null };
   const placement = asPlacement(text);
   if (placement === null) {
     throw new Error(
@@ -91,7 +91,7 @@ export function understand(sentence, shown) {
     );
   }
   const { color = shown.color, target } = placement;
-  return { suite: "place", task: placementTask(color, target), seedPlace: shown.seedPlace };
+  return { suite: "place", task: placementTask(color, target), seedPlace: shown.seedPlace, words: sentence.trim() };
 }
 
 /** The task of suite `place` with this colour and target. */
