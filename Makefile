@@ -23,7 +23,8 @@ help:
 	@echo "make test-cuda  checks that need a CUDA device"
 	@echo "make judges     LeRobot's own tests on our types: LEROBOT_SRC=checkout of its tag"
 	@echo "make neighbours LeRobot's own tests with the plugin and without: LEROBOT_SRC=the same"
-	@echo "make test-lerobot  tests and judges with another LeRobot: LEROBOT_SRC=a checkout of it"
+	@echo "make test-lerobot  tests and judges with another LeRobot: LEROBOT_SRC=a checkout of it;"
+	@echo "                and with another Python or plugins: PYTHON=python3.13 PLUGINS='PACKAGE ...'"
 	@echo "make mutants    changes of the statistics, actions and losses that no test notices: MUTANTS=400"
 	@echo "make check      ruff, format, pyright"
 	@echo "make build      sdist and wheel into dist/, tried in an environment of their own"
@@ -71,7 +72,8 @@ neighbours: setup
 
 # versions are those of constraints.txt where that LeRobot allows them
 test-lerobot: setup
-	@$(BIN)/python tests/outside/try_lerobot.py "$(LEROBOT_SRC)"
+	@$(BIN)/python tests/outside/try_lerobot.py "$(LEROBOT_SRC)" \
+		--python="$$(bash .ci/find-python $(PYTHON))" --plugins $(PLUGINS)
 
 mutants: setup
 	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt --group mutants

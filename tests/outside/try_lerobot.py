@@ -1,9 +1,10 @@
-"""Tests and judges with another version of LeRobot: `python try_lerobot.py CHECKOUT_OF_LEROBOT`.
+"""Tests and judges with another LeRobot, Python or plugin: `python try_lerobot.py CHECKOUT_OF_LEROBOT`.
 
-It is installed from the checkout into `.venv-lerobot`. Of all else, the versions are those of constraints.txt
-where this LeRobot allows them.
+LeRobot is installed from the checkout into `.venv-lerobot`. Of all else, the versions are those of
+constraints.txt where this LeRobot allows them.
 """
 
+import argparse
 import os
 import subprocess
 import sys
@@ -23,11 +24,12 @@ def preferred(constraints: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def install(checkout: Path) -> Path:
-    """Make the environment and return its Python."""
+def install(checkout: Path, base_python: str, plugins: Sequence[str]) -> Path:
+    """Make the environment of a Python, with other plugins of LeRobot; return its Python."""
     python, required, versions = FOLDER / "bin" / "python", FOLDER / "required.txt", FOLDER / "versions.txt"
-    run([sys.executable, "-m", "uv", "venv", "-q", "--clear", "-p", sys.executable, str(FOLDER)])
-    required.write_text(f"-e .[{','.join(EXTRAS)}]\n{LEROBOT} @ {checkout.as_uri()}\n")
+    run([sys.executable, "-m", "uv", "venv", "-q", "--clear", "-p", base_python, str(FOLDER)])
+    own = f"-e .[{','.join(EXTRAS)}]", f"{LEROBOT} @ {checkout.as_uri()}"
+    required.write_text("\n".join([*own, *plugins]) + "\n")
     versions.write_text(preferred((ROOT / "constraints.txt").read_text()))
     # a checkout names an index of its own for torch, a released LeRobot does not
     uv = [sys.executable, "-m", "uv", "pip"]
@@ -46,13 +48,17 @@ def run(command: Sequence[str]) -> None:
 
 def main() -> int:
     """Install, test and judge; 0 if both pass."""
-    given = sys.argv[1] if len(sys.argv) > 1 else ""
-    checkout = Path(given).expanduser().resolve()
-    found = checkout_version(checkout) if given else None
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("checkout", help="folder of a LeRobot")
+    parser.add_argument("--python", default=sys.executable, help="another Python")
+    parser.add_argument("--plugins", nargs="*", default=[], help="packages to install beside")
+    args = parser.parse_args()
+    checkout = Path(args.checkout).expanduser().resolve()
+    found = checkout_version(checkout) if args.checkout else None
     if found is None:
-        sys.exit(f"LEROBOT_SRC={given} is not a checkout of LeRobot")
+        sys.exit(f"LEROBOT_SRC={args.checkout} is not a checkout of LeRobot")
     print(f"Installing LeRobot {found} of {checkout} into {FOLDER}", flush=True)
-    python = str(install(checkout))
+    python = str(install(checkout, args.python, args.plugins))
     options = [
         "-n",
         "auto",
