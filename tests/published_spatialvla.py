@@ -261,4 +261,5 @@ def observations(num: int, seed: int = 0) -> dict[str, Any]:
 
 def cells_of(policy: SpatialvlaGridPolicy, batch: dict[str, Any]) -> Tensor:
     """(B, 12), as the original numbers them."""
-    return (policy.choose(batch, policy.config.chunk_size) + policy.first_cells).flatten(1)
+    cells_BTG = policy.choose(batch, policy.config.chunk_size)
+    return (cells_BTG + torch.tensor(policy.grids.offsets)).flatten(1)

@@ -75,8 +75,8 @@ def test_a_converted_checkpoint_chooses_the_cells_of_the_authors_classes(
 
 def first_logits(policy: SpatialvlaGridPolicy, batch: dict[str, Any]) -> torch.Tensor:
     """Return the logits of the first step's translation: (B, cells)."""
-    cells = torch.zeros(len(batch[CAMERA]), 4, 3, dtype=torch.long)
-    return policy._logits(policy._group_rows[0], policy._hidden(batch, cells)[1][:, 0, 0]).detach()
+    answer = torch.zeros(len(batch[CAMERA]), 4 * 3, dtype=torch.long)
+    return policy._logits(policy._group_rows[0], policy._hidden(batch, answer)[0][:, 0]).detach()
 
 
 QUESTION = "What action should the robot take to {}?"

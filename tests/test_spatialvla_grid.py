@@ -71,7 +71,8 @@ def test_the_loss_is_the_likelihood_among_a_slots_cells() -> None:
     batch = make_batch(policy, 2)
     loss, _ = policy(batch)
     cells_BTG = policy.grids.encode(batch["action"])
-    logits = policy.backbone.cap(policy.cell_head(policy._hidden(batch, cells_BTG)[1]))
+    hidden = policy._hidden(batch, cells_BTG.flatten(1))[0].unflatten(1, cells_BTG.shape[1:])
+    logits = policy.backbone.cap(policy.cell_head(hidden))
     expected = torch.stack(
         [
             cross_entropy(
@@ -84,7 +85,7 @@ def test_the_loss_is_the_likelihood_among_a_slots_cells() -> None:
     ).mean()
     torch.testing.assert_close(loss, expected)
     policy.config.loss_vocab = "full"
-    words = policy.backbone.vlm.lm_head(policy._hidden(batch, cells_BTG)[1])
+    words = policy.backbone.vlm.lm_head(hidden)
     whole = torch.cat([logits, policy.backbone.cap(words)], dim=-1).flatten(0, 2)
     labels = (cells_BTG + torch.tensor(policy.grids.offsets)).flatten()
     torch.testing.assert_close(policy(batch)[0], cross_entropy(whole, labels))
@@ -149,7 +150,7 @@ def saved_bytes(loss_vocab: str) -> int:
     hidden_size = 8
     policy.backbone.vlm.lm_head = nn.Linear(hidden_size, 257_152, bias=False)
     policy.cell_head = nn.Linear(hidden_size, policy.grids.num_tokens, bias=False)
-    hidden_BTGH = torch.randn(8, 4, 3, hidden_size, requires_grad=True)
+    hidden_BSH = torch.randn(8, 4 * 3, hidden_size, requires_grad=True)
     cells_BTG = policy.grids.encode(torch.rand(8, 4, 7) * 2 - 1)
     kept: dict[int, int] = {}
 
@@ -159,7 +160,7 @@ def saved_bytes(loss_vocab: str) -> int:
         return tensor
 
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        policy._losses(hidden_BTGH, cells_BTG)[0].mean().backward()
+        policy._losses(hidden_BSH, cells_BTG.flatten(1))[0].mean().backward()
     return sum(kept.values())
 
 

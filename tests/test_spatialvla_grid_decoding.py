@@ -29,8 +29,8 @@ def test_training_and_decoding_agree(prefix_attention: str) -> None:
     """Check that the teacher-forced network finds likeliest what was chosen, given what was chosen."""
     policy = make_policy(1, 7, prefix_attention=prefix_attention, use_state=True)
     batch = make_batch(policy, 3)
-    cells = policy.choose(batch, policy.config.chunk_size)
-    assert torch.equal(policy._losses(policy._hidden(batch, cells)[1], cells)[1], cells)
+    answer = policy.write(batch, policy.config.chunk_size)
+    assert torch.equal(policy._losses(policy._hidden(batch, answer)[0], answer)[1], answer)
 
 
 def test_a_rows_actions_do_not_depend_on_the_batch() -> None:
@@ -92,7 +92,7 @@ def test_samples_are_as_frequent_as_the_capped_softmax_of_a_slot() -> None:
     batch = make_batch(policy, 1)
     noise = policy._choice_noise(num_rows, (1, policy.grids.num_tokens))
     assert noise is not None
-    hidden_BH = policy._hidden(batch, policy.choose(batch, 1))[1][:, 0, 0].expand(num_rows, -1)
+    hidden_BH = policy._hidden(batch, policy.write(batch, 1))[0][:, 0].expand(num_rows, -1)
     slot = policy._group_rows[0]
     head = SlotHead(policy.cell_head.weight, noise, policy.backbone.cap)
     seen = torch.bincount(head.logits(hidden_BH, 0, slot).argmax(dim=1), minlength=slot.stop)

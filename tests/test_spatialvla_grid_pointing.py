@@ -6,11 +6,9 @@ import pytest
 import torch
 from spatialvla_grid_cases import make_batch, make_policy, rows
 from spatialvla_grid_pointing_cases import NUM_STONES, PLACES, SINGLY, STONES, pointing_batch, pointing_policy
-from torch import Tensor
 from torch.nn.functional import cross_entropy
 
 from lerobot_bomb.policies.pointing import OTHER_ACTIONS, OTHER_PLACES, PLACE
-from lerobot_policy_bomb.spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 from lerobot_policy_bomb.spatialvla_grid.pointing_spatialvla_grid import StoneCells
 
 
@@ -46,8 +44,7 @@ def test_the_loss_is_the_likelihood_among_a_slots_tokens_of_all_that_is_kept() -
         cells, loss_mask_BT, pointed = policy._targets(batch)
         is_other = pointed.given[:, 0] != pointed.meant[:, 0]
         assert 0 < is_other.sum() < 4
-        pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed.given)
-        hidden = torch.cat([pointing_BNH, hidden_BTGH.flatten(1, 2)], dim=1)
+        hidden, _ = policy._hidden(batch, torch.cat([pointed.given, cells.flatten(1)], dim=1))
         logits = policy.backbone.cap(policy.cell_head(hidden))
         words = policy.backbone.cap(policy.backbone.vlm.lm_head(hidden))
         (first, num_polar, num_gripper) = 0, *policy.grids.num_cells
@@ -77,11 +74,10 @@ def test_metrics_of_actions_skip_what_points() -> None:
     metrics = policy(batch)[1]
     assert set(metrics) == {"token_accuracy", "place_accuracy", "stone_accuracy"}
     cells, _, pointed = policy._targets(batch)
-    pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed.given)
-    right = policy._losses(hidden_BTGH, cells)[1] == cells
-    assert metrics["token_accuracy"] == pytest.approx(float(right.float().mean()))
-    place = policy._pointing_losses(pointing_BNH, pointed.meant)[1][:, 0]
-    assert metrics["place_accuracy"] == pytest.approx(float((place == torch.arange(4)).float().mean()))
+    answer = torch.cat([pointed.meant, cells.flatten(1)], dim=1)
+    right = policy._losses(policy._hidden(batch, answer)[0], answer)[1] == answer
+    assert metrics["token_accuracy"] == pytest.approx(float(right[:, 2:].float().mean()))
+    assert metrics["place_accuracy"] == pytest.approx(float(right[:, 0].float().mean()))
 
 
 def test_the_place_that_is_meant_is_predicted_where_another_is_given() -> None:
@@ -103,12 +99,9 @@ def test_a_weight_counts_the_loss_of_pointing_more_than_that_of_cells() -> None:
     policy = pointing_policy(counterfactual_share=0.0, pointing_loss_weight=3.0, **SINGLY)
     batch = pointing_batch(policy)
     cells, _, pointed = policy._targets(batch)
-    pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed.given)
-    of_pointing, of_cells = (
-        policy._pointing_losses(pointing_BNH, pointed.meant)[0],
-        policy._losses(hidden_BTGH, cells)[0],
-    )
-    expected = (3 * of_pointing.sum() + of_cells.sum()) / (of_pointing.numel() + of_cells.numel())
+    answer = torch.cat([pointed.meant, cells.flatten(1)], dim=1)
+    losses, _ = policy._losses(policy._hidden(batch, answer)[0], answer)
+    expected = (3 * losses[:, :2].sum() + losses[:, 2:].sum()) / losses.numel()
     assert float(policy(batch)[0]) == pytest.approx(float(expected), rel=1e-5)
 
 
@@ -119,13 +112,13 @@ def test_at_each_position_all_of_its_tokens_and_no_others_can_win(
 ) -> None:
     policy = pointing_policy(1, num_dims, **options)
     batch = make_batch(policy, 1)
-    slots = [*policy._pointing_rows, *policy._group_rows, *policy._group_rows]
+    answer = policy.write(batch, 2)
+    slots = policy._slots(answer)
     assert [slot.stop - slot.start for slot in slots[:2]] == [4, NUM_STONES]
     assert [slot.start for slot in slots[:2]] == [policy.grids.num_tokens, policy.grids.num_tokens + 4]
-    answer = policy.write(batch, 2)
     head = policy.cell_head.weight.clone()
     for position, slot in enumerate(slots):
-        hidden = torch.cat([states.flatten(1, -2) for states in states_of(policy, batch, answer)], dim=1)
+        hidden, _ = policy._hidden(batch, answer)
         liked = hidden[0, position] / hidden[0, position].norm()
         for token in {0, 1, slot.stop - slot.start - 1}:
             policy.cell_head.weight.copy_(head)
@@ -136,23 +129,16 @@ def test_at_each_position_all_of_its_tokens_and_no_others_can_win(
     policy.cell_head.weight.copy_(head)
 
 
-def states_of(policy: SpatialvlaGridPolicy, batch: dict[str, Any], answer: Tensor) -> tuple[Tensor, Tensor]:
-    pointed, cells = policy._split(answer)
-    return policy._hidden(batch, cells, pointed)[:2]
-
-
 @torch.no_grad()
 @pytest.mark.parametrize(("num_dims", "options"), [(4, SINGLY), (7, {})])
 def test_actions_alone_come_out_whatever_the_batch(num_dims: int, options: dict[str, Any]) -> None:
     policy = pointing_policy(2, num_dims, **options)
     batch = make_batch(policy, 3)
     answer = policy.write(batch, 2)
-    pointed, cells = policy._split(answer)
+    _, cells = policy._split(answer)
     assert answer.shape[1] == 2 + 2 * len(policy.grids.groups) == policy.last_passes == 2 + policy.last_tokens
     # what the teacher-forced network finds likeliest, given what was written, is what was written
-    pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed)
-    assert torch.equal(policy._pointing_losses(pointing_BNH, pointed)[1], pointed)
-    assert torch.equal(policy._losses(hidden_BTGH, cells)[1], cells)
+    assert torch.equal(policy._losses(policy._hidden(batch, answer)[0], answer)[1], answer)
     chunk = policy.predict_action_chunk(batch)
     assert chunk.shape == (3, 2, num_dims) and torch.equal(chunk, policy.grids.decode(cells))
     assert torch.equal(policy.select_action(batch), chunk[:, 0])
@@ -188,30 +174,26 @@ def test_an_explanation_scores_what_is_pointed_at_and_the_cells() -> None:
     explained = policy.scored()
     answer = explained.answer(batch)
     assert torch.equal(answer, policy.write(batch, 2))
-    pointed, cells = policy._split(answer)
     with torch.no_grad():
-        pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed)
-        losses = policy._pointing_losses(pointing_BNH, pointed)[0].sum()
-        losses += policy._losses(hidden_BTGH, cells)[0].sum()
-        torch.testing.assert_close(explained.score(explained.encode(batch), answer), -losses[None])
+        losses, _ = policy._losses(policy._hidden(batch, answer)[0], answer)
+        torch.testing.assert_close(explained.score(explained.encode(batch), answer), -losses.sum(dim=1))
 
 
 def test_an_explanation_says_where_it_points() -> None:
     policy = pointing_policy(**SINGLY)
     batch = make_batch(policy, 1)
     found = policy.scored().pointed(batch)
-    pointed, cells = policy._split(policy.write(batch, 2))
-    place, stone = pointed[0].tolist()
+    answer = policy.write(batch, 2)
+    place, stone = answer[0, :2].tolist()
     assert (
         found is not None and found.held is None and found.place_xy.tolist() == pytest.approx(PLACES[place])
     )
     x, y = divmod(stone, 7)
     assert found.stone_xy.tolist() == pytest.approx([-0.13 + 0.04 * (x + 0.5), -0.13 + 0.04 * (y + 0.5)])
     with torch.no_grad():
-        states = policy._hidden(batch, cells, pointed)[0]
-        losses = [
-            policy._pointing_losses(states, torch.tensor([[each, stone]]))[0][0, 0] for each in range(4)
-        ]
+        states, _ = policy._hidden(batch, answer)
+        others = (torch.cat([torch.tensor([[each]]), answer[:, 1:]], dim=1) for each in range(4))
+        losses = [policy._losses(states, other)[0][0, 0] for other in others]
     shares = [float((-loss).exp()) for loss in losses]
     assert [*found.probabilities.values()] == pytest.approx(shares, abs=1e-5)
     assert [*map(list, found.probabilities)] == [pytest.approx(each) for each in PLACES]

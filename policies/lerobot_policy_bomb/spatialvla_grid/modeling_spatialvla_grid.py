@@ -72,7 +72,6 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
     config: SpatialvlaGridConfig
     shapes, as_trained = SHAPES, AS_TRAINED
     symbol_ids: Tensor
-    first_cells: Tensor  # (G,) int64, of each group among all cells
     # modules that FSDP shards one by one; accelerate reads the second name
     _fsdp_wrap_modules: ClassVar[list[str]] = ["Gemma2DecoderLayer", "SiglipEncoderLayer"]
     _no_split_modules = _fsdp_wrap_modules
@@ -101,7 +100,6 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         num_fixed = self.layout.num_tokens + num_answer
         self._check_length(self.backbone.text_config, num_fixed, config.prompt_template, dataset_meta)
         self._num_cells_of_base: list[int] | None = None  # if the grids are other than the checkpoint's
-        self.register_buffer("first_cells", torch.tensor(self.grids.offsets), persistent=False)
         hidden_size = self.backbone.text_config.hidden_size
         self.cell_embedding = nn.Embedding(self._num_rows, hidden_size)
         self.cell_head = nn.Linear(hidden_size, self._num_rows, bias=False)
@@ -181,7 +179,6 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         self._num_cells_of_base = old.num_cells
         self.grids = new.to(self._device)
         self.cell_embedding.num_embeddings = self.cell_head.out_features = self._num_rows
-        self.first_cells = torch.tensor(new.offsets, device=self._device)
         self.config.grid_params = new.to_dict()
 
     def scored(self) -> ScoredSpatialvlaGrid:
@@ -211,14 +208,19 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
             raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
         self._begin_batch()
         cells_BTG, loss_mask_BT, pointed = self._targets(batch)
+        given_BS, answer_BS = (
+            torch.cat([tokens_BN, cells_BTG.flatten(1)], dim=1)
+            for tokens_BN in (pointed.given, pointed.meant)
+        )
         with self.autocast():
-            pointing_BNH, hidden_BTGH, features_BPH = self._hidden(batch, cells_BTG, pointed.given)
-            losses_BTG, chosen_BTG = self._losses(hidden_BTGH, cells_BTG)
-            losses_BN, chosen_BN = self._pointing_losses(pointing_BNH, pointed.meant)
-            losses_BN = self.config.pointing_loss_weight * losses_BN
-        loss_mask_BTG = loss_mask_BT[..., None].expand_as(losses_BTG)
-        loss_mask_BS = pad(loss_mask_BTG.flatten(1), (losses_BN.shape[1], 0), value=True)
-        losses_BS = torch.cat([losses_BN, losses_BTG.flatten(1)], dim=1) * loss_mask_BS
+            hidden_BSH, features_BPH = self._hidden(batch, given_BS)
+            losses_BS, chosen_BS = self._losses(hidden_BSH, answer_BS)
+        chosen_BN, chosen_BTG = self._split(chosen_BS)
+        num_pointing = chosen_BN.shape[1]
+        loss_mask_BTG = loss_mask_BT[..., None].expand_as(chosen_BTG)
+        loss_mask_BS = pad(loss_mask_BTG.flatten(1), (num_pointing, 0), value=True)
+        losses_BS = losses_BS * loss_mask_BS
+        losses_BS[:, :num_pointing] *= self.config.pointing_loss_weight
         parts = self._cell_parts(chosen_BTG, cells_BTG, loss_mask_BTG) | pointed.parts(chosen_BN)
         if reduction == "none":
             loss = losses_BS.sum(dim=1) / loss_mask_BS.sum(dim=1).clamp(min=1)
@@ -245,29 +247,19 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         )
         return self.grids.encode(actions_BTD), loss_mask_BT, pointed
 
-    def _hidden(
-        self, batch: dict[str, Tensor], cells_BTG: Tensor, pointed_BN: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return teacher-forced states (B, N, H) and (B, T, G, H) that predict pointing tokens and cells.
+    def _hidden(self, batch: dict[str, Tensor], answer_BS: Tensor) -> tuple[Tensor, Tensor]:
+        """Return teacher-forced states (B, S, H) that predict an answer, and image features of all cameras.
 
-        Also return image features (B, P, H), P of all cameras.
+        The features are (B, P of all images, H).
         """
-        if pointed_BN is None:
-            pointed_BN = cells_BTG.new_empty(len(cells_BTG), 0)
         prompt = self.prompt(batch)
-        answer_BS = torch.cat([pointed_BN, cells_BTG.flatten(1)], dim=1)
         embeds_BLH = self.embed(prompt.ids, self.encode_images(batch))
         features_BPH = embeds_BLH[:, self.layout.image_columns(embeds_BLH.device)]
-        return *self._hidden_after(prompt, embeds_BLH, answer_BS), features_BPH
+        return self._hidden_after(prompt, embeds_BLH, answer_BS), features_BPH
 
-    def _hidden_after(
-        self, prompt: TokenRows, embeds_BLH: Tensor, answer_BS: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _hidden_after(self, prompt: TokenRows, embeds_BLH: Tensor, answer_BS: Tensor) -> Tensor:
         """Return the states of `_hidden`, for prompts that are embedded already."""
-        pointed_BN, cells_BTG = self._split(answer_BS)
-        first_N = [slot.start for slot in self._pointing_rows]
-        pointed_BN = pointed_BN + pointed_BN.new_tensor(first_N)
-        rows_BS = torch.cat([pointed_BN, (cells_BTG + self.first_cells).flatten(1)], dim=1)
+        rows_BS = answer_BS + answer_BS.new_tensor([slot.start for slot in self._slots(answer_BS)])
         embeds_BXH = torch.cat([embeds_BLH, self._embed_cells(rows_BS[:, :-1])], dim=1)
         answer = TokenRows(rows_BS[:, 1:], torch.ones_like(rows_BS[:, 1:], dtype=torch.bool))
         rows = TokenRows.join([prompt, answer])
@@ -281,58 +273,43 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
             (rows.mask.cumsum(dim=1) - 1).clamp(min=0),
             attention_mask_XX & rows.attention_mask[:, None],
         )
-        return self._split(hidden_BXH[:, -rows_BS.shape[1] :])
+        return hidden_BXH[:, -rows_BS.shape[1] :]
 
     def _split(self, answer: Tensor) -> tuple[Tensor, Tensor]:
         """(B, S, ...) of an answer -> (B, N, ...) of pointing tokens and (B, T, G, ...) of cells."""
         pointing, cells = answer.tensor_split([len(self._pointing_rows)], dim=1)
         return pointing, cells.unflatten(1, (-1, len(self.grids.groups)))
 
+    def _slots(self, answer_BS: Tensor) -> list[slice]:
+        """Return the rows of the tables that may be chosen at each position of an answer."""
+        pointing, groups = self._pointing_rows, self._group_rows
+        return pointing + groups * ((answer_BS.shape[1] - len(pointing)) // len(groups))
+
     def log_probability(self, prompt: TokenRows, embeds_BLH: Tensor, answer_BS: Tensor) -> Tensor:
         """Return log-probabilities (B,) of answers after embedded prompts."""
-        pointed_BN, cells_BTG = self._split(answer_BS)
-        pointing_BNH, hidden_BTGH = self._hidden_after(prompt, embeds_BLH, answer_BS)
-        score_B = self._log_probability(self._group_rows, hidden_BTGH, cells_BTG)
-        if self.pointer is None:
-            return score_B
-        as_step = pointing_BNH[:, None], pointed_BN[:, None]
-        return score_B + self._log_probability(self._pointing_rows, *as_step)
+        hidden_BSH = self._hidden_after(prompt, embeds_BLH, answer_BS)
+        slots = zip(self._slots(answer_BS), hidden_BSH.unbind(1), answer_BS.unbind(1), strict=True)
+        chosen = [
+            self._logits(slot, hidden_BH).float().log_softmax(dim=-1).gather(-1, tokens_B[:, None])
+            for slot, hidden_BH, tokens_B in slots
+        ]
+        return torch.cat(chosen, dim=-1).sum(dim=1)
 
-    def _log_probability(self, rows: list[slice], hidden_BTGH: Tensor, tokens_BTG: Tensor) -> Tensor:
-        """Return log-probabilities (B,) of tokens; ``rows`` are the choices in each of G slots."""
-        chosen = []
-        for i, slot in enumerate(rows):
-            logits_BTC = self._logits(slot, hidden_BTGH[:, :, i]).float()
-            chosen.append(logits_BTC.log_softmax(dim=-1).gather(-1, tokens_BTG[:, :, i, None]))
-        return torch.cat(chosen, dim=-1).sum(dim=(1, 2))
-
-    def _losses(
-        self, hidden_BTGH: Tensor, cells_BTG: Tensor, rows: list[slice] | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Return losses and likeliest cells, (B, T, G) each; ``rows``: those of other tokens than cells."""
+    def _losses(self, hidden_BSH: Tensor, answer_BS: Tensor) -> tuple[Tensor, Tensor]:
+        """Return losses and likeliest tokens, (B, S) each."""
         losses, chosen = [], []
-        slots = self._group_rows if rows is None else rows
-        for slot, hidden_BTH, labels_BT in zip(
-            slots, hidden_BTGH.unbind(2), cells_BTG.unbind(2), strict=True
-        ):
-            logits_BTC = self._logits(slot, hidden_BTH).float()
-            chosen.append(logits_BTC.detach().argmax(dim=-1))
+        slots = zip(self._slots(answer_BS), hidden_BSH.unbind(1), answer_BS.unbind(1), strict=True)
+        for slot, hidden_BH, labels_B in slots:
+            logits_BC = self._logits(slot, hidden_BH).float()
+            chosen.append(logits_BC.detach().argmax(dim=-1))
             if self.config.loss_vocab == "full":
-                logits_BTC, labels_BT = self._full_logits(hidden_BTH), labels_BT + slot.start
-            losses.append(cross_entropy(logits_BTC.transpose(1, 2), labels_BT, reduction="none"))
-        return torch.stack(losses, dim=2), torch.stack(chosen, dim=2)
+                logits_BC, labels_B = self._full_logits(hidden_BH), labels_B + slot.start
+            losses.append(cross_entropy(logits_BC, labels_B, reduction="none"))
+        return torch.stack(losses, dim=1), torch.stack(chosen, dim=1)
 
-    def _pointing_losses(self, hidden_BNH: Tensor, tokens_BN: Tensor) -> tuple[Tensor, Tensor]:
-        """Return losses and likeliest tokens, (B, N) each."""
-        if self.pointer is None:
-            return torch.zeros_like(tokens_BN, dtype=torch.float32), tokens_BN
-        as_step = hidden_BNH[:, None], tokens_BN[:, None], self._pointing_rows
-        losses_B1N, chosen_B1N = self._losses(*as_step)
-        return losses_B1N[:, 0], chosen_B1N[:, 0]
-
-    def _full_logits(self, hidden_BTH: Tensor) -> Tensor:
-        """Return logits (B, T, all cells, then the vocabulary)."""
-        logits = [self.cell_head(hidden_BTH), self.backbone.vlm.lm_head(hidden_BTH)]
+    def _full_logits(self, hidden: Tensor) -> Tensor:
+        """(..., H) -> logits (..., all cells, then the vocabulary)."""
+        logits = [self.cell_head(hidden), self.backbone.vlm.lm_head(hidden)]
         return self.backbone.cap(torch.cat(logits, dim=-1).float())
 
     @torch.no_grad()
@@ -382,11 +359,11 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         """Return what the policy points at in a batch of one row; None if it does not point."""
         if self.pointer is None:
             return None
-        pointed_1N, cells_1TG = self._split(self.write(batch, self.config.chunk_size))
+        answer_1S = self.write(batch, self.config.chunk_size)
         with torch.no_grad(), self.autocast():
-            pointing_1NH, *_ = self._hidden(batch, cells_1TG, pointed_1N)
-            logits_1P = self._logits(self._pointing_rows[0], pointing_1NH[:, 0]).float()
-        return self.pointer.pointed_at(pointed_1N[0], logits_1P[0].softmax(dim=0))
+            hidden_1SH, _ = self._hidden(batch, answer_1S)
+            logits_1P = self._logits(self._pointing_rows[0], hidden_1SH[:, 0]).float()
+        return self.pointer.pointed_at(self._split(answer_1S)[0][0], logits_1P[0].softmax(dim=0))
 
     @property
     def last_passes(self) -> int | None:
