@@ -14,7 +14,7 @@ from pathlib import Path
 from run_judges import ROOT, checkout_version
 
 FOLDER = ROOT / ".venv-lerobot"
-EXTRAS = ("pusht", "libero")
+EXTRAS = ("pusht", "libero", "sapien", "so101")  # as `make setup`
 LEROBOT = "lerobot"
 
 
