@@ -73,7 +73,7 @@ neighbours: setup
 # versions are those of constraints.txt where that LeRobot allows them
 test-lerobot: setup
 	@$(BIN)/python tests/outside/try_lerobot.py "$(LEROBOT_SRC)" \
-		--python="$$(bash .ci/find-python $(PYTHON))" --plugins $(PLUGINS)
+		$(if $(PYTHON),--python="$(PYTHON)") --plugins $(PLUGINS)
 
 mutants: setup
 	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt --group mutants

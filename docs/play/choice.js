@@ -1,4 +1,5 @@
-// What is shown: suite, seed, task, the visitor's words, axes, levels and who acts, as the page's address and as flags of a command.
+// What is shown: suite, seed, task, the visitor's words, axes, levels and who acts, as the page's address and as flags
+// of a command.
 import { POLICY, SEEDS, SUITES, perturbations } from "./constants.js";
 
 const { AXES, MAX_LEVEL } = perturbations;

@@ -36,7 +36,7 @@ class Page {
     this._choice = { ...DEFAULT_CHOICE };
     await this._tell(async () => {
       try {
-        await this._show(choiceOf(location.hash));
+        await this._show(await this._linked());
       } catch (error) {
         await this._show(DEFAULT_CHOICE);
         throw error;
@@ -71,7 +71,7 @@ class Page {
     });
     byId("play").addEventListener("click", () => (this._isPlaying ? this._pause() : this._play()));
     byId("restart").addEventListener("click", () => this._tell(() => this._show(this._choice)));
-    addEventListener("hashchange", () => this._tell(() => this._show(choiceOf(location.hash))));
+    addEventListener("hashchange", () => this._tell(async () => this._show(await this._linked())));
     for (const button of document.querySelectorAll("[data-copy]")) {
       button.addEventListener("click", () => copy(button, byId(button.dataset.copy)));
     }
@@ -92,6 +92,15 @@ class Page {
     return this._suites[suite];
   }
 
+  /** The choice of the page's address. */
+  async _linked() {
+    const choice = choiceOf(location.hash);
+    if (choice.words === null) return choice;
+    const { suite, task } = understand(choice.words, shownOf(choice, await this._record(choice.suite)));
+    if (suite === choice.suite && task === choice.task) return choice;
+    throw new Error("The link's words and its task ask for different things.");
+  }
+
   /** Show the start of an episode. */
   async _show(choice) {
     this._pause();
@@ -100,12 +109,6 @@ class Page {
     const numTasks = record.episodes.length;
     if (choice.task !== null && choice.task >= numTasks) {
       throw new Error(`Suite ${choice.suite} has tasks 0 to ${numTasks - 1}; there is no task ${choice.task}.`);
-    }
-    if (choice.words !== null) {
-      const meant = understand(choice.words, shownOf(choice, record));
-      if (meant.suite !== choice.suite || meant.task !== choice.task) {
-        throw new Error("The link's words and its task ask for different things.");
-      }
     }
     if ("dynamics" in choice.levels) this._noise ??= await readJson("noise.json");
     const act = choice.policy === null ? undefined : await this._policy();

@@ -208,10 +208,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
             raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
         self._begin_batch()
         cells_BTG, loss_mask_BT, pointed = self._targets(batch)
-        given_BS, answer_BS = (
-            torch.cat([tokens_BN, cells_BTG.flatten(1)], dim=1)
-            for tokens_BN in (pointed.given, pointed.meant)
-        )
+        given_BS, answer_BS = self._join(pointed.given, cells_BTG), self._join(pointed.meant, cells_BTG)
         with self.autocast():
             hidden_BSH, features_BPH = self._hidden(batch, given_BS)
             losses_BS, chosen_BS = self._losses(hidden_BSH, answer_BS)
@@ -259,19 +256,21 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
 
     def _hidden_after(self, prompt: TokenRows, embeds_BLH: Tensor, answer_BS: Tensor) -> Tensor:
         """Return the states of `_hidden`, for prompts that are embedded already."""
-        rows_BS = answer_BS + answer_BS.new_tensor([slot.start for slot in self._slots(answer_BS)])
+        rows_BS = answer_BS.clone()
+        for rows, positions in self._slots():
+            rows_BS[:, positions] += rows.start
         embeds_BXH = torch.cat([embeds_BLH, self._embed_cells(rows_BS[:, :-1])], dim=1)
         answer = TokenRows(rows_BS[:, 1:], torch.ones_like(rows_BS[:, 1:], dtype=torch.bool))
-        rows = TokenRows.join([prompt, answer])
-        index_X = torch.arange(rows.mask.shape[1], device=rows_BS.device)
+        tokens = TokenRows.join([prompt, answer])
+        index_X = torch.arange(tokens.mask.shape[1], device=rows_BS.device)
         attention_mask_XX = index_X <= index_X[:, None]
         if self._bidirectional_prompt:
             is_prompt_X = index_X < prompt.mask.shape[1]
             attention_mask_XX |= is_prompt_X & is_prompt_X[:, None]
         hidden_BXH = self.backbone.hidden_states(
             embeds_BXH,
-            (rows.mask.cumsum(dim=1) - 1).clamp(min=0),
-            attention_mask_XX & rows.attention_mask[:, None],
+            (tokens.mask.cumsum(dim=1) - 1).clamp(min=0),
+            attention_mask_XX & tokens.attention_mask[:, None],
         )
         return hidden_BXH[:, -rows_BS.shape[1] :]
 
@@ -280,32 +279,38 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         pointing, cells = answer.tensor_split([len(self._pointing_rows)], dim=1)
         return pointing, cells.unflatten(1, (-1, len(self.grids.groups)))
 
-    def _slots(self, answer_BS: Tensor) -> list[slice]:
-        """Return the rows of the tables that may be chosen at each position of an answer."""
+    @staticmethod
+    def _join(pointing_BN: Tensor, cells_BTG: Tensor) -> Tensor:
+        """Return the answer (B, S) that `_split` takes apart."""
+        return torch.cat([pointing_BN, cells_BTG.flatten(1)], dim=1)
+
+    def _slots(self) -> list[tuple[slice, slice]]:
+        """Return the rows of the tables and the positions in an answer, of each pointing token and group."""
         pointing, groups = self._pointing_rows, self._group_rows
-        return pointing + groups * ((answer_BS.shape[1] - len(pointing)) // len(groups))
+        once = [(rows, slice(i, i + 1)) for i, rows in enumerate(pointing)]
+        in_each_step = [(rows, slice(len(pointing) + i, None, len(groups))) for i, rows in enumerate(groups)]
+        return once + in_each_step
 
     def log_probability(self, prompt: TokenRows, embeds_BLH: Tensor, answer_BS: Tensor) -> Tensor:
         """Return log-probabilities (B,) of answers after embedded prompts."""
         hidden_BSH = self._hidden_after(prompt, embeds_BLH, answer_BS)
-        slots = zip(self._slots(answer_BS), hidden_BSH.unbind(1), answer_BS.unbind(1), strict=True)
-        chosen = [
-            self._logits(slot, hidden_BH).float().log_softmax(dim=-1).gather(-1, tokens_B[:, None])
-            for slot, hidden_BH, tokens_B in slots
-        ]
-        return torch.cat(chosen, dim=-1).sum(dim=1)
+        chosen = []
+        for rows, positions in self._slots():
+            logits_BTC = self._logits(rows, hidden_BSH[:, positions]).float()
+            chosen.append(logits_BTC.log_softmax(dim=-1).gather(-1, answer_BS[:, positions, None]))
+        return torch.cat(chosen, dim=1).sum(dim=(1, 2))
 
     def _losses(self, hidden_BSH: Tensor, answer_BS: Tensor) -> tuple[Tensor, Tensor]:
         """Return losses and likeliest tokens, (B, S) each."""
-        losses, chosen = [], []
-        slots = zip(self._slots(answer_BS), hidden_BSH.unbind(1), answer_BS.unbind(1), strict=True)
-        for slot, hidden_BH, labels_B in slots:
-            logits_BC = self._logits(slot, hidden_BH).float()
-            chosen.append(logits_BC.detach().argmax(dim=-1))
+        losses_BS, chosen_BS = torch.empty_like(answer_BS, dtype=torch.float32), torch.empty_like(answer_BS)
+        for rows, positions in self._slots():
+            hidden_BTH, labels_BT = hidden_BSH[:, positions], answer_BS[:, positions]
+            logits_BTC = self._logits(rows, hidden_BTH).float()
+            chosen_BS[:, positions] = logits_BTC.detach().argmax(dim=-1)
             if self.config.loss_vocab == "full":
-                logits_BC, labels_B = self._full_logits(hidden_BH), labels_B + slot.start
-            losses.append(cross_entropy(logits_BC, labels_B, reduction="none"))
-        return torch.stack(losses, dim=1), torch.stack(chosen, dim=1)
+                logits_BTC, labels_BT = self._full_logits(hidden_BTH), labels_BT + rows.start
+            losses_BS[:, positions] = cross_entropy(logits_BTC.transpose(1, 2), labels_BT, reduction="none")
+        return losses_BS, chosen_BS
 
     def _full_logits(self, hidden: Tensor) -> Tensor:
         """(..., H) -> logits (..., all cells, then the vocabulary)."""
