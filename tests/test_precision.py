@@ -10,6 +10,7 @@ from lerobot.policies.factory import get_policy_class
 from policy_cases import CASES, save_checkpoint
 from torch import Tensor
 
+import lerobot_bomb.policies.policy
 from lerobot_bomb.decoding.qkv import RopePairs
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.vlm.backbone import PRODUCTS
@@ -30,6 +31,17 @@ def test_checkpointing_in_bfloat16_changes_no_gradient(policy_type: str) -> None
     assert kept.keys() == computed_again.keys()
     for name, gradient in kept.items():
         torch.testing.assert_close(computed_again[name], gradient, msg=name)
+
+
+@pytest.mark.parametrize("is_fast", [False, True])
+def test_bfloat16_that_the_processor_lacks_is_warned_of(
+    is_fast: bool, policy_type: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(lerobot_bomb.policies.policy, "is_bfloat16_fast", lambda: is_fast)
+    CASES[policy_type].make_policy(dtype="float32")
+    assert not caplog.messages
+    CASES[policy_type].make_policy(dtype="bfloat16")
+    assert len(caplog.messages) == (not is_fast)
 
 
 def load(folder: Path, **options: Any) -> Any:

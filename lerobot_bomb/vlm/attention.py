@@ -1,4 +1,4 @@
-"""Attention masks, that is, which token of a sequence attends to which; and attention's precision on a CPU.
+"""Attention masks, that is, which token of a sequence attends to which; and bfloat16 on a CPU.
 
 Shapes: `B` batch, `L` tokens that attend, `X` tokens that are attended to.
 """
@@ -28,6 +28,12 @@ class Float32Attention(TorchFunctionMode):
         with torch.autocast("cpu", enabled=False):
             attended = func(*map(_float32, args), **exact_kwargs)
         return attended.to(args[0].dtype)
+
+
+def is_bfloat16_fast() -> bool:
+    """Return False if this CPU has no instructions that torch computes bfloat16 products with."""
+    # torch has no public question for it; of other libraries than oneDNN it knows nothing
+    return not torch.backends.mkldnn.is_available() or torch.ops.mkldnn._is_mkldnn_bf16_supported()
 
 
 def _float32(value: Any) -> Any:
