@@ -6,6 +6,7 @@ SHELL := /bin/bash
 
 BIN := .venv/bin
 STAMP := .venv/.installed
+EXTRAS := pusht,libero,sapien,so101
 NPM_FLAGS ?= --omit=dev  # --include=dev: also what tests of the page in a browser need
 # two torch threads beside another job are many times slower than one
 export OMP_NUM_THREADS ?= 1
@@ -44,7 +45,7 @@ $(STAMP): pyproject.toml constraints.txt lerobot_bomb/__init__.py
 		{ echo "Creating .venv with $$python"; "$$python" -m venv --clear .venv || exit 1; }
 	@if [ ! -x $(BIN)/uv ]; then echo "Installing uv into .venv"; $(BIN)/python -m pip install -q uv || exit 1; fi
 	@echo "Installing packages under constraints.txt"
-	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt -e '.[pusht,libero,sapien,so101]' --group dev
+	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt -e '.[$(EXTRAS)]' --group dev
 	@touch $@
 
 demo: setup
@@ -73,7 +74,7 @@ neighbours: setup
 # versions are those of constraints.txt where that LeRobot allows them
 test-lerobot: setup
 	@$(BIN)/python tests/outside/try_lerobot.py "$(LEROBOT_SRC)" \
-		$(if $(PYTHON),--python="$(PYTHON)") --plugins $(PLUGINS)
+		--extras=$(EXTRAS) $(if $(PYTHON),--python="$(PYTHON)") --plugins $(PLUGINS)
 
 mutants: setup
 	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt --group mutants

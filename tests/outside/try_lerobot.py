@@ -14,7 +14,6 @@ from pathlib import Path
 from run_judges import ROOT, checkout_version
 
 FOLDER = ROOT / ".venv-lerobot"
-EXTRAS = ("pusht", "libero", "sapien", "so101")  # as `make setup`
 LEROBOT = "lerobot"
 
 
@@ -24,11 +23,11 @@ def preferred(constraints: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def install(checkout: Path, base_python: str, plugins: Sequence[str]) -> Path:
+def install(checkout: Path, base_python: str, extras: str, plugins: Sequence[str]) -> Path:
     """Make the environment of a Python, with other plugins of LeRobot; return its Python."""
     python, required, versions = FOLDER / "bin" / "python", FOLDER / "required.txt", FOLDER / "versions.txt"
     run([sys.executable, "-m", "uv", "venv", "-q", "--clear", "-p", base_python, str(FOLDER)])
-    own = f"-e .[{','.join(EXTRAS)}]", f"{LEROBOT} @ {checkout.as_uri()}"
+    own = f"-e .[{extras}]", f"{LEROBOT} @ {checkout.as_uri()}"
     required.write_text("\n".join([*own, *plugins]) + "\n")
     versions.write_text(preferred((ROOT / "constraints.txt").read_text()))
     # a checkout names an index of its own for torch, a released LeRobot does not
@@ -50,6 +49,7 @@ def main() -> int:
     """Install, test and judge; 0 if both pass."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("checkout", help="folder of a LeRobot")
+    parser.add_argument("--extras", required=True, help="of this package, joined by commas")
     parser.add_argument("--python", default=sys.executable, help="another Python")
     parser.add_argument("--plugins", nargs="*", default=[], help="packages to install beside")
     args = parser.parse_args()
@@ -58,7 +58,7 @@ def main() -> int:
     if found is None:
         sys.exit(f"LEROBOT_SRC={args.checkout} is not a checkout of LeRobot")
     print(f"Installing LeRobot {found} of {checkout} into {FOLDER}", flush=True)
-    python = str(install(checkout, args.python, args.plugins))
+    python = str(install(checkout, args.python, args.extras, args.plugins))
     options = [
         "-n",
         "auto",
