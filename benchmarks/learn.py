@@ -44,9 +44,10 @@ from machine import make_parser, parse_with_policy_flags, positive, write_figure
 from recipes import POLICY_TYPES, last_checkpoint, read_recipe, recipe_path
 
 from lerobot_bomb.checkpoints.identity import sha256_of
-from lerobot_bomb.checkpoints.names import WEIGHTS
+from lerobot_bomb.checkpoints.names import CONFIG, WEIGHTS
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.conditions import NONE
+from lerobot_bomb.files import read_json
 from lerobot_bomb.results.bomb import EpisodeResult, put_down
 from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.results.instructions import named_targets, other_instructions
@@ -373,10 +374,12 @@ def evaluate(
     if not finished.exists():
         shutil.rmtree(output_dir, ignore_errors=True)
         task_flags = [f"--env.task_ids={list(task.task_ids)}"] if task.task_ids else []
+        is_probe = read_json(checkpoint / CONFIG)["type"] == PROBE
+        # not --policy.*, which would become an override of the checkpoint's config
+        probe_flags = [f"--env.discover_packages_path={PLUGIN}"] if is_probe else []
         run_command(
             "lerobot-eval",
-            # not --policy.*, which would become an override of the checkpoint's config
-            f"--env.discover_packages_path={PLUGIN}",
+            *probe_flags,
             f"--policy.path={checkpoint}",
             "--env.type=bomb",
             f"--env.task={task.suite}",
