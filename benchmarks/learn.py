@@ -148,7 +148,9 @@ def run_claimed(args: argparse.Namespace, task: Task, run: dict[str, Any]) -> in
             **run,
             "training": minutes,
             # two trainings that end in other bits part between two of these
-            "weights_sha256": {step: sha256_of(path / WEIGHTS) for step, path in checkpoints(folder).items()},
+            "weights_sha256": {
+                step: sha256_of(path / WEIGHTS) for step, path in checkpoints(folder / "train").items()
+            },
             "points": {name: asdict(point) for name, point in points.items()},
             "on_named": num_named,
             "conditions": conditions,
@@ -300,9 +302,9 @@ def probe_recipe() -> list[str]:
     ]
 
 
-def checkpoints(folder: Path) -> dict[int, Path]:
-    """Return the checkpoints, {training step: folder}."""
-    paths = sorted((folder / "train" / "checkpoints").glob("[0-9]*"))
+def checkpoints(train_dir: Path) -> dict[int, Path]:
+    """Return the checkpoints of `lerobot-train --output_dir=train_dir`, {training step: folder}."""
+    paths = sorted((train_dir / "checkpoints").glob("[0-9]*"))
     return {int(path.name): path / "pretrained_model" for path in paths}
 
 
@@ -318,7 +320,7 @@ def evaluate_checkpoints(
             first_seed,
             task.episodes if step == last else min(CURVE_EPISODES, task.episodes),
         )
-        for step, checkpoint in checkpoints(folder).items()
+        for step, checkpoint in checkpoints(folder / "train").items()
     }
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
@@ -69,12 +70,23 @@ def draw(points: list[Point], title: str, path: Path) -> None:
         rates = [count / point.num_episodes for count, point in zip(counts, points, strict=True)]
         width = 2 * (len(curves) - number)  # the later ones are drawn over the others, where they agree
         axes.plot(minutes, rates, marker="o", color=color, linewidth=width, label=name)
-    axes.yaxis.set_major_formatter(PercentFormatter(1))
-    axes.set(title=title, xlabel="CPU minutes of training", xlim=(0, None), ylim=(-0.02, 1.02))
-    axes.grid(axis="y", color="#e1e1e1")
+    set_up_rates(axes, title)
     axes.legend(loc="lower right")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
+
+
+def set_up_rates(axes: Axes, title: str) -> None:
+    """Set up axes of rates over CPU minutes of training."""
+    set_up(axes, title)
+    axes.set(ylim=(-0.02, 1.02))
+    axes.yaxis.set_major_formatter(PercentFormatter(1))
+
+
+def set_up(axes: Axes, title: str) -> None:
+    """Set up axes of something that is never negative, over CPU minutes of training."""
+    axes.set(title=title, xlabel="CPU minutes of training", xlim=(0, None), ylim=(0, None))
+    axes.grid(axis="y", color="#e1e1e1")
 
 
 def _cells(point: Point) -> list[str]:

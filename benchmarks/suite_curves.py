@@ -2,7 +2,8 @@ r"""Success in each suite, and how far from the destination policies read it, ov
 
 Evaluates the checkpoints of one or more trainings by `lerobot-train`, each of which began where the one
 before ended, and draws two pictures: successes per suite, and the error of the destination that is read from
-static scenes that no training has seen, one recording per kind of task. What is finished is not done again.
+static scenes that no training has seen, one recording per kind of task (of `vla0_smol`; other types report no
+such error). What is finished is not done again.
 
     OMP_NUM_THREADS=1 python benchmarks/suite_curves.py TRAINING... --s_per_step=1.2 --output_dir=curves \
         --scenes relations=FOLDER ... --plot=curves.png
@@ -13,11 +14,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from statistics import mean
 
-from learn import REPO_ID, evaluate
+from learn import REPO_ID, checkpoints, evaluate
+from learning_curve import set_up, set_up_rates
 from learning_tasks import Task
 from machine import make_parser, parse_on_idle_machine, positive, write_figures
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
 
 from lerobot_bomb.commands.run import run_command
 
@@ -32,7 +33,7 @@ def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("trainings", type=Path, nargs="+", help="output folders of lerobot-train, in order")
     parser.add_argument("--s_per_step", type=float, required=True, help="CPU seconds of a training step")
-    parser.add_argument("--scenes", nargs="+", default=[], help="NAME=FOLDER of static scenes")
+    parser.add_argument("--scenes", nargs="+", default=[], help="NAME=FOLDER of static scenes, for vla0_smol")
     parser.add_argument("--episodes", type=positive, default=20, help="of a suite, each (default: 20)")
     parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to resume in")
     parser.add_argument("--plot", type=Path, required=True, help="write the curves to this PNG")
@@ -40,7 +41,7 @@ def main() -> None:
     args.output_dir.mkdir(parents=True, exist_ok=True)
     rates: dict[str, dict[float, float]] = {suite: {} for suite in SUITES}
     errors_mm: dict[str, dict[float, float]] = {text.partition("=")[0]: {} for text in args.scenes}
-    for minutes, checkpoint in checkpoints(args.trainings, args.s_per_step).items():
+    for minutes, checkpoint in checkpoints_over_minutes(args.trainings, args.s_per_step).items():
         folder = args.output_dir / f"{minutes:06.1f}_minutes"
         for suite in SUITES:
             task = Task((), episodes=args.episodes, trainings={}, suite=suite)
@@ -53,14 +54,14 @@ def main() -> None:
     write_figures(args.json, {"success": rates, "error_mm": errors_mm, "episodes": args.episodes})
 
 
-def checkpoints(trainings: list[Path], s_per_step: float) -> dict[float, Path]:
+def checkpoints_over_minutes(trainings: list[Path], s_per_step: float) -> dict[float, Path]:
     """Return {CPU minutes since the first training began: checkpoint}."""
     found, steps_before = {}, 0
     for training in trainings:
-        steps = sorted((training / "checkpoints").glob("[0-9]*"))
-        for path in steps:
-            found[(steps_before + int(path.name)) * s_per_step / 60] = path / "pretrained_model"
-        steps_before += int(steps[-1].name)
+        of_training = checkpoints(training)
+        for step, checkpoint in of_training.items():
+            found[(steps_before + step) * s_per_step / 60] = checkpoint
+        steps_before += max(of_training)
     return found
 
 
@@ -93,12 +94,9 @@ def draw(
     for axes, curves in ((left, rates), (right, errors_mm)):
         for (name, curve), color in zip(curves.items(), COLORS, strict=False):
             axes.plot(list(curve), list(curve.values()), marker="o", color=color, label=name)
-        axes.set(xlabel="CPU minutes of training", xlim=(0, None))
-        axes.grid(axis="y", color="#e1e1e1")
         axes.legend()
-    left.set(title=f"success, {num_episodes} episodes each", ylim=(-0.02, 1.02))
-    left.yaxis.set_major_formatter(PercentFormatter(1))
-    right.set(title="error of the destination that is read [mm]", ylim=(0, None))
+    set_up_rates(left, f"success, {num_episodes} episodes each")
+    set_up(right, "error of the destination that is read [mm]")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
 

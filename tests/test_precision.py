@@ -10,7 +10,7 @@ from lerobot.policies.factory import get_policy_class
 from policy_cases import CASES, save_checkpoint
 from torch import Tensor
 
-import lerobot_bomb.policies.policy
+import lerobot_bomb.vlm.attention
 from lerobot_bomb.decoding.qkv import RopePairs
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.vlm.backbone import PRODUCTS
@@ -37,7 +37,7 @@ def test_checkpointing_in_bfloat16_changes_no_gradient(policy_type: str) -> None
 def test_bfloat16_that_the_processor_lacks_is_warned_of(
     is_fast: bool, policy_type: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(lerobot_bomb.policies.policy, "is_bfloat16_fast", lambda: is_fast)
+    monkeypatch.setattr(lerobot_bomb.vlm.attention, "is_bfloat16_fast", lambda: is_fast)
     CASES[policy_type].make_policy(dtype="float32")
     assert not caplog.messages
     CASES[policy_type].make_policy(dtype="bfloat16")

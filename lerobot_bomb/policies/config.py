@@ -189,7 +189,7 @@ class VlaConfig(ChunkConfig):
     use_state: bool = True
     # do not train the vision model; a nano model needs false
     freeze_vision_encoder: bool = False
-    # "bfloat16": autocast over float32 weights, in training and evaluation; slower on a CPU without AVX-512
+    # "bfloat16": autocast over float32 weights, in training and evaluation
     dtype: str = "float32"
     # "bfloat16": cast the weights once, when a checkpoint is loaded. Half the memory, the same actions; needs
     # dtype=bfloat16, and not for training

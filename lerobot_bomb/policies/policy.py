@@ -1,6 +1,5 @@
 """Base of our policies."""
 
-import logging
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Iterator
@@ -38,13 +37,11 @@ from lerobot_bomb.training.distributed import SavesTiedWeightsOnce
 from lerobot_bomb.training.muon import parameter_groups
 from lerobot_bomb.training.policy_flags import MUON, check_as_trained, check_weights_fit, trained_with
 from lerobot_bomb.training.randomness import begin_batch
-from lerobot_bomb.vlm.attention import Float32Attention, is_bfloat16_fast
+from lerobot_bomb.vlm.attention import Float32Attention, warn_if_bfloat16_is_slow
 from lerobot_bomb.vlm.inputs import read_state, read_task, read_tensor
 from lerobot_bomb.vlm.layout import INSTRUCTION, PromptLayout
 from lerobot_bomb.vlm.prompt import task_ids, task_text
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
-
-logger = logging.getLogger(__name__)
 
 
 def _is_chunk_policy(policy: nn.Module) -> bool:
@@ -236,11 +233,8 @@ class VlaPolicy(ChunkPolicy):
                 f"--policy.weights_dtype={config.weights_dtype} is for the evaluation of a checkpoint; give "
                 f"--policy.weights_dtype=float32"
             )
-        if config.dtype == "bfloat16" and config.device == "cpu" and not is_bfloat16_fast():
-            logger.warning(
-                "--policy.dtype=bfloat16 takes several times as long as float32 on this processor, which has "
-                "no instructions for it; give --policy.dtype=float32"
-            )
+        if config.dtype == "bfloat16" and config.device == "cpu":
+            warn_if_bfloat16_is_slow()
         _take_action_names(config, dataset_meta)
         super().__init__(config, dataset_meta)
 

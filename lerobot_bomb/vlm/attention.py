@@ -3,6 +3,7 @@
 Shapes: `B` batch, `L` tokens that attend, `X` tokens that are attended to.
 """
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import scaled_dot_product_attention
 from torch.overrides import TorchFunctionMode
+
+logger = logging.getLogger(__name__)
 
 
 class Float32Attention(TorchFunctionMode):
@@ -28,6 +31,15 @@ class Float32Attention(TorchFunctionMode):
         with torch.autocast("cpu", enabled=False):
             attended = func(*map(_float32, args), **exact_kwargs)
         return attended.to(args[0].dtype)
+
+
+def warn_if_bfloat16_is_slow() -> None:
+    """Warn of bfloat16 on a CPU that has no instructions for it."""
+    if not is_bfloat16_fast():
+        logger.warning(
+            "--policy.dtype=bfloat16 takes several times as long as float32 on this processor, which has no "
+            "instructions for it; give --policy.dtype=float32"
+        )
 
 
 def is_bfloat16_fast() -> bool:
