@@ -38,6 +38,7 @@ def test_bfloat16_that_the_processor_lacks_is_warned_of(
     is_fast: bool, policy_type: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(lerobot_bomb.vlm.attention, "is_bfloat16_fast", lambda: is_fast)
+    caplog.set_level("WARNING", logger="lerobot_bomb")  # another test may have lowered it to INFO
     CASES[policy_type].make_policy(dtype="float32")
     assert not caplog.messages
     CASES[policy_type].make_policy(dtype="bfloat16")
