@@ -32,6 +32,12 @@ FILES = {
     "stable_scanned_objects/bowl/bowl.xml": BOWL,
     "stable_scanned_objects/bowl/visual/bowl.msh": "a mesh",
 }
+RECORDING = """
+from lerobot_bomb.libero.episode import LiberoSpec
+from lerobot_bomb.libero.goals import check_goals
+check_goals([LiberoSpec(0)])
+print("checked")
+"""
 IMPORT = """from lerobot_bomb.libero.assets import Libero
 Libero.find().write_config()
 import libero.libero
@@ -246,6 +252,17 @@ def test_the_real_one_is_imported_without_a_question(
         timeout=60,
     )
     assert run.stdout == "imported\n", run.stderr
+
+
+def test_a_recording_needs_no_config_file(with_assets: Libero) -> None:
+    run = subprocess.run(
+        [sys.executable, "-c", RECORDING],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert run.stdout.endswith("checked\n"), run.stderr
 
 
 def test_the_real_one_s_assets_suffice_for_one_suite_and_are_partly_missing_for_others(

@@ -19,10 +19,10 @@ def check_goals(specs: Iterable[LiberoSpec]) -> None:
     Raises:
         ValueError: LIBERO or its assets are missing, or a task's file names another predicate.
     """
-    from libero.libero import benchmark  # slow
-
     specs = sorted(specs, key=lambda spec: (spec.suite, spec.task_id))
     folder = prepare_libero({spec.suite for spec in specs}).task_folders()["bddl_files"]
+    from libero.libero import benchmark  # slow, and asks a question where prepare_libero has written no file
+
     for spec in specs:
         task = benchmark.get_benchmark_dict()[spec.suite]().get_task(spec.task_id)
         check_predicates(folder / task.problem_folder / task.bddl_file)
