@@ -1,6 +1,8 @@
 """`vla0_smol` points, then acts: numbers before the actions, learned, never hidden, and obeyed."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -298,8 +300,8 @@ def test_an_explanation_says_where_it_points() -> None:
 # Data
 
 
-def pointing_dataset(root: Path) -> LeRobotDatasetMetadata:
-    """Write three frames, their gripper at the low end, in the middle and at the high end of its range."""
+def pointing_dataset(root: Path, stones_x: Sequence[float] = (0.05, 0.05, 0.05)) -> LeRobotDatasetMetadata:
+    """Write frames, their gripper at the low end, in the middle and at the high end of its range in turn."""
     sizes = {PLACE: 2, STONE: 3, OTHER_PLACES: 4, OTHER_ACTIONS: 8}
     features: dict[str, Any] = {
         key: {"dtype": "float32", "shape": (size,), "names": None} for key, size in sizes.items()
@@ -307,8 +309,10 @@ def pointing_dataset(root: Path) -> LeRobotDatasetMetadata:
     for key in ("observation.state", "action"):
         features[key] = {"dtype": "float32", "shape": (4,), "names": NAMES}
     dataset = LeRobotDataset.create("test/points", fps=10, features=features, root=root, use_videos=False)
-    for state in ([-0.1, -0.2, 0.0, 0.0], [0.0, 0.0, 0.05, 1.0], [0.1, 0.2, 0.1, 1.0]):
+    states = [-0.1, -0.2, 0.0, 0.0], [0.0, 0.0, 0.05, 1.0], [0.1, 0.2, 0.1, 1.0]
+    for state, stone_x in zip(cycle(states), stones_x, strict=False):
         frame: dict[str, Any] = {key: np.full(size, 0.05, np.float32) for key, size in sizes.items()}
+        frame[STONE][0] = stone_x
         frame["observation.state"] = np.array(state, np.float32)
         frame["action"] = np.array(
             [2 * state[0], state[1], state[2], 0.5], np.float32
@@ -373,6 +377,20 @@ def test_a_checkpoint_goes_on_as_it_began(tmp_path: Path, began: bool, is_old: b
         Vla0SmolPolicy.from_pretrained(tmp_path / "checkpoint", config=config, dataset_meta=meta)
     with pytest.raises(ValueError, match=f"{flag}: this checkpoint was trained with {began}"):
         Vla0SmolPolicy.from_pretrained(tmp_path / "checkpoint", config=config)
+
+
+def test_a_stone_that_fell_off_the_table_is_cut_to_the_range(tmp_path: Path) -> None:
+    lost, others = [0.6], 199 * [0.05]
+    policy = build(pointing_dataset(tmp_path / "own_episodes", others + lost))
+    assert policy.pointer is not None
+    batch = pointing_batch(policy)
+    labels = policy.pointer.labels(batch, 0.0, "vla0_smol", policy.generator)
+    far, edge = (replace(labels, stone_xy=torch.full_like(labels.stone_xy, x)) for x in (0.6, 0.3))
+    state = batch["observation.state"]
+    assert torch.equal(policy.pointer.bins_of(far, state), policy.pointer.bins_of(edge, state))
+    meta = pointing_dataset(tmp_path / "other_units", others + 3 * lost)
+    with pytest.raises(ValueError, match=r"pointing_range_m=0\.3: .*stone of test/points is up to 0\.6 m"):
+        build(meta)
 
 
 def test_another_range_would_mean_other_places(tmp_path: Path) -> None:
