@@ -33,6 +33,7 @@ from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.rollout_pool import RolloutSettings, collect
 from lerobot_bomb.envs.rollout import Moment, make_env
 from lerobot_bomb.evaluation.trivial import Demonstrations
+from lerobot_bomb.policies import pointing
 from lerobot_bomb.policies.pointing import places_of
 from lerobot_env_bomb.bomb.env import BombEnv
 from lerobot_policy_bomb.fdvla import FdvlaConfig
@@ -241,12 +242,16 @@ def test_a_dataset_that_does_not_point_is_refused(recorded: dict[str, Path], tmp
         make_config(pointing=True).take_places(meta)
 
 
-def test_a_checkpoint_points_at_its_own_places_only(recorded: dict[str, Path]) -> None:
+def test_a_checkpoint_points_at_its_own_places_only(
+    recorded: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     meta = LeRobotDatasetMetadata("test/static", root=recorded["scenes"])
     found = places_of(meta, None)
     assert places_of(meta, [*found, [0.5, 0.5]]) == [*found, [0.5, 0.5]]
     with pytest.raises(ValueError, match=r"test/static points at .*, which is no place of this checkpoint"):
         places_of(meta, found[1:])
+    monkeypatch.setattr(pointing, "RARE", 0.99)  # of all that this dataset points at
+    assert places_of(meta, found[1:]) == found[1:]
 
 
 def test_lerobot_merges_scenes_with_demonstrations_and_the_suite_stays_known(

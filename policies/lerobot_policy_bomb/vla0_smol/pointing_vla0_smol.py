@@ -17,6 +17,7 @@ from lerobot_bomb.data.columns import present_episodes, read_columns
 from lerobot_bomb.policies.pointing import (
     OTHER_PLACES,
     PLACE,
+    RARE,
     STONE,
     DataUnits,
     MetricLabels,
@@ -25,7 +26,6 @@ from lerobot_policy_bomb.vla0_smol.configuration_vla0_smol import Vla0SmolConfig
 
 # x and y of the stone, of the place, of the way from the gripper to the place
 NUM_NUMBERS = 6
-MOST = 0.99  # share of the frames whose stone must be in range
 STONE_NUMBERS, PLACE_NUMBERS, WAY_NUMBERS = slice(0, 2), slice(2, 4), slice(4, 6)
 
 
@@ -82,8 +82,7 @@ class TextPointer(DataUnits):
         columns = read_columns(meta, (PLACE, STONE, OTHER_PLACES), present_episodes(meta))
         for key in (PLACE, STONE, OTHER_PLACES):
             away_m = np.abs(columns[key][:, :2] if key == STONE else columns[key]).max(axis=1)
-            # a policy's own episodes hold a few frames of stones that it knocked off the table
-            farthest_m = np.quantile(away_m, MOST, method="higher") if key == STONE else away_m.max()
+            farthest_m = np.quantile(away_m, 1 - RARE, method="higher") if key == STONE else away_m.max()
             if farthest_m > self._range_m:
                 raise ValueError(
                     f"--policy.pointing_range_m={self._range_m}: {key} of {meta.repo_id} is up to "
