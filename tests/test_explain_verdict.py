@@ -323,7 +323,9 @@ def test_a_success_needs_no_other_words() -> None:
 
 def test_a_run_that_ended_otherwise_than_its_record_says_so() -> None:
     episode = {"result": result("imprecise"), "recorded": result(), "moments": [moment()]}
-    assert verdict([episode])[1].startswith("In its record it ended otherwise (success)")
+    assert verdict([episode])[1].startswith("In its record it ended otherwise (success after ")
+    later = episode | {"recorded": result("imprecise", steps=77)}
+    assert verdict([later])[1].startswith("In its record it ended otherwise (imprecise after 77 steps)")
     assert not verdict([episode | {"recorded": result("imprecise")}])[1].startswith("In its record")
 
 

@@ -74,10 +74,12 @@ def count_outcomes(results: Sequence[Values]) -> str:
 
 def as_recorded(result: Values, recorded: Values | None) -> list[str]:
     """Return a sentence if the episode ended otherwise than its record says."""
-    if recorded is None or recorded["failure"] == result["failure"]:
+    # a policy that draws noise may fail alike, but at another time and place
+    if recorded is None or all(recorded.get(name) == result.get(name) for name in ("failure", "steps")):
         return []
     then = recorded["failure"] or "success"
-    return [f"In its record it ended otherwise ({then}): what follows is about the run shown here."]
+    after = f" after {recorded['steps']} steps" if "steps" in recorded else ""
+    return [f"In its record it ended otherwise ({then}{after}): what follows is about the run shown here."]
 
 
 def without_perturbations(counterfactuals: Sequence[Values]) -> list[str]:
