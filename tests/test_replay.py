@@ -79,6 +79,28 @@ def test_a_record_is_run_again_bit_for_bit(
         assert "as recorded, bit for bit: spec, is_success, failure, " in capsys.readouterr().out
 
 
+def test_as_many_threads_compute_as_then(
+    results: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Others would round sums otherwise."""
+    import torch
+
+    from lerobot_bomb.viewing.checkpoint import LoadedPolicy
+
+    path = results("bomb:fdvla", *FLAGS)
+    then = json.loads(path.read_text().splitlines()[0])["inference"]
+    file = rewritten(path, tmp_path / "three.jsonl", inference=then | {"device": "cpu, 3 threads"})
+    seen, act, before = set(), LoadedPolicy.act, torch.get_num_threads()
+
+    def watched(loaded: LoadedPolicy, batch: dict[str, Any]) -> Any:
+        seen.add(torch.get_num_threads())
+        return act(loaded, batch)
+
+    monkeypatch.setattr(LoadedPolicy, "act", watched)
+    main(["replay", str(file), *FLAGS, f"--output={tmp_path / 'again'}"])
+    assert seen == {3} and torch.get_num_threads() == before
+
+
 def test_a_later_batch_draws_its_own_noise_again(
     results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

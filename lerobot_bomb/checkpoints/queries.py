@@ -1,8 +1,9 @@
 """Timing of the queries of this process' policy, whatever its type."""
 
+import re
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -100,6 +101,17 @@ def _queue_lengths(policy: PreTrainedPolicy) -> dict[tuple[str, ...], int]:
                 (name, str(key)): len(queue) for key, queue in value.items() if isinstance(queue, deque)
             }
     return lengths
+
+
+@contextmanager
+def threads_of(device: str) -> Iterator[None]:
+    """Compute on as many CPU threads as a record's device says: on others, sums are rounded otherwise."""
+    named, before = re.fullmatch(r"cpu, (\d+) threads?", device), torch.get_num_threads()
+    torch.set_num_threads(int(named[1]) if named else before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _told(policy: PreTrainedPolicy, name: str) -> Any:

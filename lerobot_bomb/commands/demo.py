@@ -7,7 +7,7 @@ from datetime import datetime
 from pathlib import Path
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
-from lerobot_bomb.commands.arguments import ANSWER_IS_NO, path_flag
+from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.results_files import read_undamaged
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.conditions import NONE
@@ -89,9 +89,7 @@ def _replay(folder: Path, name: str, records: dict[int, Record]) -> None:
         print(f"There is no {name}.")
         return
     results, output = folder / RESULTS, folder / name
-    words = ["replay", str(results), f"--line={lines[-1]}", f"--output={output}"]
-    # on some processors an action depends on the batch's size in its last digits, and replay says so
-    run_command("lerobot-bomb", *words, accepted=(0, ANSWER_IS_NO))
+    run_command("lerobot-bomb", "replay", str(results), f"--line={lines[-1]}", f"--output={output}")
 
 
 def _say(step: int, text: str) -> None:

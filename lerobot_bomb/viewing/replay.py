@@ -2,7 +2,7 @@
 
 import shlex
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -88,9 +88,17 @@ class Replay:
 
     @contextmanager
     def _agent(self, viewed: Viewed, _: gymnasium.Env) -> Iterator[Agent]:
-        agents = one_of_batch(self._batch_agent(viewed), viewed.make_env, viewed.spec.seed, *self._place)
-        with agents as agent:
-            yield agent
+        with self._threads():
+            agents = one_of_batch(self._batch_agent(viewed), viewed.make_env, viewed.spec.seed, *self._place)
+            with agents as agent:
+                yield agent
+
+    def _threads(self) -> AbstractContextManager[None]:
+        if self.record.inference is None:
+            return nullcontext()
+        from lerobot_bomb.checkpoints.queries import threads_of  # LeRobot and torch: seconds
+
+        return threads_of(self.record.inference.device)
 
     @property
     def _place(self) -> tuple[int, int]:
