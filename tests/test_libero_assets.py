@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -42,6 +43,11 @@ IMPORT = """from lerobot_bomb.libero.assets import Libero
 Libero.find().write_config()
 import libero.libero
 print("imported")"""
+
+
+def run_code(code: str, **options: Any) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, **options)
 
 
 def write(path: Path, text: str) -> None:
@@ -243,25 +249,12 @@ def test_the_real_one_is_imported_without_a_question(
     installed: Libero, home: Path, stdin: int | None
 ) -> None:
     close = (lambda: os.close(0)) if stdin is None else None
-    run = subprocess.run(
-        [sys.executable, "-c", IMPORT],
-        stdin=stdin,
-        preexec_fn=close,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    run = run_code(IMPORT, stdin=stdin, preexec_fn=close)
     assert run.stdout == "imported\n", run.stderr
 
 
 def test_a_recording_needs_no_config_file(with_assets: Libero) -> None:
-    run = subprocess.run(
-        [sys.executable, "-c", RECORDING],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    run = run_code(RECORDING, stdin=subprocess.DEVNULL)
     assert run.stdout.endswith("checked\n"), run.stderr
 
 

@@ -41,7 +41,11 @@ def outcome(result: Values) -> str:
 
 def _ending(result: Values) -> str:
     name = "It succeeded" if result["is_success"] else f"It failed ({result['failure']})"
-    return f"{name} after {result['steps']} steps" if "steps" in result else name
+    return name + _after(result)
+
+
+def _after(result: Values) -> str:
+    return f" after {result['steps']} steps" if "steps" in result else ""
 
 
 def _distances(result: Values) -> list[str]:
@@ -77,9 +81,8 @@ def as_recorded(result: Values, recorded: Values | None) -> list[str]:
     # a policy that draws noise may fail alike, but at another time and place
     if recorded is None or all(recorded.get(name) == result.get(name) for name in ("failure", "steps")):
         return []
-    then = recorded["failure"] or "success"
-    after = f" after {recorded['steps']} steps" if "steps" in recorded else ""
-    return [f"In its record it ended otherwise ({then}{after}): what follows is about the run shown here."]
+    then = (recorded["failure"] or "success") + _after(recorded)
+    return [f"In its record it ended otherwise ({then}): what follows is about the run shown here."]
 
 
 def without_perturbations(counterfactuals: Sequence[Values]) -> list[str]:

@@ -26,7 +26,7 @@ LABELS = f"{OBS_PREFIX}{PREFIX}"  # prefix of the labels' columns in a dataset
 PLACE, STONE, OTHER_PLACES, OTHER_ACTIONS, SPOTS = (f"{OBS_PREFIX}{name}" for name in COLUMNS)
 GRIPPER = ("x", "y", "z")  # dimensions of the state
 SAME_PLACE_M = 1e-3
-# share of the frames that may point where a policy cannot: in its own episodes, a stone may fall off the
+# share of the labels that may be where a policy cannot point: in its own episodes, a stone may fall off the
 # table, or its part of the tray be taken
 RARE = 0.01
 SMALLEST = 1e-8  # difference that LeRobot's normaliser divides by

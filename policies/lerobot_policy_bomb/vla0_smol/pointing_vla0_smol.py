@@ -80,9 +80,10 @@ class TextPointer(DataUnits):
         """
         config.require_labels(meta)
         columns = read_columns(meta, (PLACE, STONE, OTHER_PLACES), present_episodes(meta))
-        for key in (PLACE, STONE, OTHER_PLACES):
-            away_m = np.abs(columns[key][:, :2] if key == STONE else columns[key]).max(axis=1)
-            farthest_m = np.quantile(away_m, 1 - RARE, method="higher") if key == STONE else away_m.max()
+        stones = columns[STONE][:, :2]
+        farthest = {key: np.abs(columns[key]).max() for key in (PLACE, OTHER_PLACES)}
+        farthest[STONE] = np.quantile(np.abs(stones).max(axis=1), 1 - RARE, method="higher")
+        for key, farthest_m in farthest.items():
             if farthest_m > self._range_m:
                 raise ValueError(
                     f"--policy.pointing_range_m={self._range_m}: {key} of {meta.repo_id} is up to "
